@@ -1,0 +1,113 @@
+# Two commands run everything: make reproduce, make test. Both build .venv first where it is missing or out of date.
+
+SHELL := /bin/bash
+.SHELLFLAGS := -euo pipefail -c
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.NOTPARALLEL:
+
+# --- what you may set --------------------------------------------------------------------------------------------
+# The first Python 3.11 that starts.
+PYTHON ?= $(shell for p in python3.11 python3 python; do \
+	"$$p" -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' 2>/dev/null && { echo "$$p"; break; }; done)
+# PyTorch's index of CPU wheels, as its install page gives it; needed where pip cannot find the CPU wheel by itself.
+TORCH_INDEX ?=
+# CUDA=1 installs torch with CUDA instead of the CPU build.
+CUDA ?=
+# make lock: the uv program, and a folder that holds torch's CPU wheel.
+UV ?= uv
+FIND_LINKS ?=
+
+# --- the environment of every run --------------------------------------------------------------------------------
+# Keep freed memory instead of handing it back to the system after each step: about 10 % of training time (glibc).
+export MALLOC_MMAP_THRESHOLD_ ?= 4294967296
+export MALLOC_TRIM_THRESHOLD_ ?= 8589934592
+
+TORCH := 2.13.0
+PY := .venv/bin/python
+PIP := env -u PYTHONDONTWRITEBYTECODE $(PY) -m pip --disable-pip-version-check install --quiet --only-binary :all:
+STAMP := .venv/.installed
+PAPERMILL := $(PY) -m papermill --kernel python3
+
+.PHONY: help .venv reproduce smoke test lint unit notebooks-test lab lock clean clean-all force
+
+help: ## List the targets
+	@grep -hE '^[.a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | awk -F'\t' '{ printf "  make %-15s %s\n", $$1, $$2 }'
+
+reproduce: $(STAMP) ## Run the whole experiment, preset quick: render, train, evaluate, draw
+	@mkdir -p data/generated
+	$(PAPERMILL) notebooks/run_all.ipynb data/generated/run_all_quick.ipynb -p preset quick
+
+smoke: $(STAMP) ## The same with the preset smoke: every stage, tiny
+	@mkdir -p data/generated
+	$(PAPERMILL) notebooks/run_all.ipynb data/generated/run_all_smoke.ipynb -p preset smoke
+
+test: lint unit notebooks-test ## Every check: lint, unit and notebooks-test
+
+lint: $(STAMP) ## Check the style with ruff
+	$(PY) -m ruff check .
+
+unit: $(STAMP) ## Run the tests in tests/
+	$(PY) -m pytest tests
+
+# run_all would run every notebook a second time: a test in tests/ runs it through papermill.
+notebooks-test: $(STAMP) ## Run the notebooks and compare their outputs with the committed ones
+	$(PY) -m pytest --nbval --nbval-current-env --nbval-cell-timeout=600 \
+		--nbval-sanitize-with=tests/nbval_sanitize.cfg notebooks/0*.ipynb
+
+lab: $(STAMP) ## Open the notebooks in JupyterLab
+	$(PY) -m jupyterlab notebooks
+
+# --- installation ------------------------------------------------------------------------------------------------
+.venv: $(STAMP) ## Make the virtual environment from environment.lock (CUDA=1: torch with CUDA)
+
+# A CPU environment is made anew where CUDA is asked for; a CUDA environment stays one.
+ifeq ($(CUDA),1)
+ifneq ($(shell cat $(STAMP) 2>/dev/null),cuda)
+$(STAMP): force
+endif
+endif
+
+# torch comes before the rest, for it is the one package that pip may need an extra index for: what follows finds it
+# installed, and its absence is told in a second instead of after all other downloads. The .pth file makes
+# the folder mmgsd importable as it stands.
+$(STAMP): environment.lock
+	@[ -n "$(PYTHON)" ] && "$(PYTHON)" -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' 2>/dev/null || { \
+		echo "mmgsd needs Python 3.11, the only version its Blender module is built for:" \
+			"install it, or name it with PYTHON=/path/to/python3.11." >&2; exit 1; }
+	@echo "Making .venv from environment.lock: two minutes or more, 3 GB on disk"
+	"$(PYTHON)" -m venv --clear .venv
+	@awk '/^torch==/ { on = 1; print; next } /^[^ #]/ { on = 0 } on' environment.lock > .venv/torch.lock
+	@awk '/^torch==/ { on = 1; next } /^[^ #]/ { on = 0 } !on' environment.lock > .venv/rest.lock
+ifeq ($(CUDA),1)
+	$(PIP) --require-hashes --no-deps -r .venv/rest.lock
+	$(PIP) $(if $(TORCH_INDEX),--extra-index-url "$(TORCH_INDEX)") "torch==$(TORCH),!=$(TORCH)+cpu"
+else
+	@$(PIP) --require-hashes --no-deps $(if $(TORCH_INDEX),--extra-index-url "$(TORCH_INDEX)") -r .venv/torch.lock || { \
+		echo "torch's CPU build could not be installed. If pip found no version $(TORCH)+cpu above, run the command" \
+			"again with TORCH_INDEX=... set to PyTorch's index of CPU wheels, the address that the install page" \
+			"of PyTorch gives for 'CPU'; for the CUDA build set CUDA=1 instead." >&2; exit 1; }
+	$(PIP) --require-hashes -r environment.lock
+endif
+	@pwd > "$$($(PY) -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/mmgsd.pth"
+	@echo $(if $(filter 1,$(CUDA)),cuda,cpu) > $@
+
+lock: ## Make environment.lock from pyproject.toml (UV=uv, FIND_LINKS=folder with torch's CPU wheel)
+	@{ echo "# Every package of the project, pinned and hashed, for Python 3.11 on Linux x86-64. Made from pyproject.toml by"; \
+		echo "#    make lock FIND_LINKS=<a folder with the wheel of torch $(TORCH)+cpu>"; \
+		echo "# which keeps the pins it finds here; delete this file first to move all of them on."; } > environment.head
+	@[ ! -f environment.lock ] || cp environment.lock environment.new
+	echo "torch==$(TORCH)+cpu" | $(UV) pip compile --quiet --python-version 3.11 --generate-hashes --no-header --all-extras \
+		$(if $(FIND_LINKS),--find-links "$(FIND_LINKS)") --annotation-style line --output-file environment.new pyproject.toml -
+	@sed -i -E 's/-r -(, |$$)//; s/, $$//' environment.new
+	cat environment.head environment.new > environment.lock
+	@rm environment.head environment.new
+
+# --- cleaning ----------------------------------------------------------------------------------------------------
+clean: ## Remove caches and what the preset smoke made
+	rm -rf .pytest_cache .ruff_cache .hypothesis data/generated/smoke data/results/smoke figures/smoke
+	rm -f data/generated/run_all_smoke.ipynb
+	find . -path ./.venv -prune -o \( -name __pycache__ -o -name .ipynb_checkpoints \) -type d -exec rm -rf {} +
+
+clean-all: clean ## Remove also .venv and everything generated: renders and trained models
+	rm -rf .venv data/generated

@@ -1,0 +1,268 @@
+"""One frozen dataclass for each stage, and the presets ``smoke``, ``quick`` and ``paper``.
+
+A configuration is everything that decides a result. How it is computed (workers, scheduler address, overwrite) is
+an argument of the stage, never part of its configuration.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import hashlib
+import json
+import math
+import os
+from pathlib import Path
+from typing import Any, TypeVar
+
+OBJECTS = ("cloth", "rope")
+METHODS = ("pcl", "spcl", "unimodal", "mmgsd")
+IMAGE_SIZE = {"cloth": (485, 485), "rope": (640, 480)}  # (width, height) px, paper section "Quantitative Results"
+DEFAULT_GROUP = {"cloth": "c4", "rope": "c2"}
+N_POINTS = 625  # material points of each object
+
+Config = TypeVar("Config", bound="RenderConfig | TrainConfig | EvaluateConfig")
+
+
+def _check(name: str, value: Any, accepted: str, ok: bool) -> None:
+    if not ok:
+        raise ValueError(f"{name} must be {accepted}, got {value!r}")
+
+
+def _check_choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
+    close = difflib.get_close_matches(str(value), choices, n=1)
+    hint = f" (did you mean {close[0]!r}?)" if close else ""
+    _check(name, value, f"one of {', '.join(map(repr, choices))}{hint}", value in choices)
+
+
+_set_frozen = object.__setattr__  # a field named ``object`` hides the builtin inside a class body
+
+
+def _check_types(config: Any) -> None:
+    """Reject values whose type is not the field's: a string steps='200' would fail much later."""
+    kinds = {"int": int, "float": (int, float), "str": str, "bool": bool}
+    for field in dataclasses.fields(config):
+        value, kind = getattr(config, field.name), str(field.type)
+        wrong_bool = isinstance(value, bool) and kind != "bool"
+        if wrong_bool or not isinstance(value, kinds[kind]) or (kind == "float" and not math.isfinite(value)):
+            raise ValueError(f"{field.name} must be {'a finite float' if kind == 'float' else kind}, got {value!r}")
+        if kind == "float":  # 1 and 1.0 are one configuration, with one digest
+            _set_frozen(config, field.name, float(value))
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RenderConfig:
+    """What a rendered data set holds."""
+
+    object: str = "cloth"
+    train_images: int = 60
+    test_images: int = 20
+    views: int = 10  # images of one simulation, each with its own camera, light and material
+    samples: int = 4  # Cycles samples a pixel
+    rotation_deg: float = 180.0  # the object is turned by an angle from ± this; 45 is prior work's fix (cloth)
+    ball: bool = False  # a ball at the rope's first end: prior work's way to break its symmetry
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        _check_types(self)
+        _check_choice("object", self.object, OBJECTS)
+        for name in ("train_images", "test_images", "views", "samples"):
+            _check(name, getattr(self, name), "at least 1", getattr(self, name) >= 1)
+        _check("rotation_deg", self.rotation_deg, "in (0, 180]", 0 < self.rotation_deg <= 180)
+        _check("ball", self.ball, "False for a cloth", not self.ball or self.object == "rope")
+        _check("seed", self.seed, "at least 0", self.seed >= 0)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) of an image in px."""
+        return IMAGE_SIZE[self.object]
+
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TrainConfig:
+    """How one model is trained. Pixels are those of the full image, whatever the network's input size."""
+
+    object: str = "cloth"
+    method: str = "mmgsd"
+    group: str = ""  # symmetry group the matches come from; "" is the object's own (c4 or c2)
+    network: str = "lite0"  # or "resnet34", the contrastive papers' reference
+    descriptor_dim: int = 32
+    input_px: int = 128  # the longer side of the network's input
+    steps: int = 600
+    batch: int = 16  # images a step
+    pairs: int = 60  # ordered pairs of a batch's images
+    queries: int = 64  # source points a pair
+    learning_rate: float = 1.5e-3
+    schedule: str = "cosine"  # or "step": times 0.9 every 250 steps, the reference of the contrastive losses
+    weight_decay: float = 0.02
+    sigma_px: float = 1.0  # std of a target mode at the end of training
+    sigma_start_px: float = 48.0  # std at its start; annealed geometrically over the first two thirds
+    margin: float = 0.5  # contrastive losses only
+    non_matches: int = 150  # a match, half of them on the object (contrastive losses only)
+    augment: bool = True
+    rotate: bool = True  # augmentation turns images by any angle; off where the rotation limit is the experiment
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        _check_types(self)
+        _check_choice("object", self.object, OBJECTS)
+        _check_choice("method", self.method, METHODS)
+        _check_choice("network", self.network, ("lite0", "resnet34"))
+        _check_choice("schedule", self.schedule, ("cosine", "step"))
+        _set_frozen(self, "group", self.group or DEFAULT_GROUP[self.object])
+        for name in ("descriptor_dim", "steps", "pairs", "queries"):
+            _check(name, getattr(self, name), "at least 1", getattr(self, name) >= 1)
+        _check("non_matches", self.non_matches, "at least 2 (on and off the object)", self.non_matches >= 2)
+        for name in ("learning_rate", "sigma_px", "sigma_start_px", "margin"):
+            _check(name, getattr(self, name), "greater than 0", getattr(self, name) > 0)
+        _check("batch", self.batch, "at least 2 (a pair)", self.batch >= 2)
+        _check("input_px", self.input_px, "at least 64", self.input_px >= 64)
+        for name in ("weight_decay", "seed"):
+            _check(name, getattr(self, name), "at least 0", getattr(self, name) >= 0)
+
+    @property
+    def name(self) -> str:
+        """Folder name: what a reader looks for, and a digest of everything else."""
+        sigma = f"-sigma{self.sigma_px:g}" if self.method in ("unimodal", "mmgsd") else ""
+        return f"{self.object}-{self.method}-{self.group}{sigma}-{digest(self)}"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class EvaluateConfig:
+    """Which questions an evaluation asks (paper section "Quantitative Results")."""
+
+    pairs: int = 500  # pairs of test images
+    points: int = 625  # source material points a pair, an evenly spread subset where fewer
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        _check_types(self)
+        _check("pairs", self.pairs, "at least 1", self.pairs >= 1)
+        _check("points", self.points, f"between 1 and {N_POINTS}", 1 <= self.points <= N_POINTS)
+        _check("seed", self.seed, "at least 0", self.seed >= 0)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Preset:
+    """One size of the whole experiment; every size runs the same stages."""
+
+    name: str
+    render: dict[str, RenderConfig]
+    train: dict[str, TrainConfig]  # one an object; the other methods replace ``method`` and nothing else
+    evaluate: EvaluateConfig
+    ablation: dict[str, TrainConfig]  # the equal budget of the sigma ablation
+    sigmas_px: tuple[float, ...]
+
+    def method(self, object: str, method: str) -> TrainConfig:
+        """The training configuration of one method on one object."""
+        return dataclasses.replace(self.train[object], method=method)
+
+
+def _preset(
+    name: str, *, train: dict, rope: dict, ablation: dict, evaluate: dict, sigmas: tuple, **render: int
+) -> Preset:
+    cloth_train = TrainConfig(object="cloth", **train)
+    rope_train = TrainConfig(object="rope", **{**train, **rope})
+    return Preset(
+        name=name,
+        render={o: RenderConfig(object=o, **render) for o in OBJECTS},
+        train={"cloth": cloth_train, "rope": rope_train},
+        evaluate=EvaluateConfig(**evaluate),
+        ablation={t.object: dataclasses.replace(t, **ablation) for t in (cloth_train, rope_train)},
+        sigmas_px=sigmas,
+    )
+
+
+def load_preset(name: str) -> Preset:
+    """The preset ``smoke``, ``quick`` or ``paper``; ValueError for any other name."""
+    _check_choice("preset", name, tuple(PRESETS))
+    return PRESETS[name]
+
+
+PRESETS = {
+    "smoke": _preset(
+        "smoke",
+        train_images=16, test_images=8, views=4,
+        train={"steps": 6, "batch": 4, "pairs": 6, "queries": 16, "input_px": 64}, rope={},
+        ablation={"steps": 4}, sigmas=(1.0, 16.0),
+        evaluate={"pairs": 4, "points": 25},
+    ),
+    "quick": _preset(
+        "quick",
+        train_images=400, test_images=60, views=10,
+        train={"steps": 400}, rope={"input_px": 160},
+        ablation={"steps": 150}, sigmas=(1.0, 4.0, 16.0),
+        evaluate={"pairs": 60, "points": 625},
+    ),
+    "paper": _preset(
+        "paper",
+        train_images=3500, test_images=500, views=10,
+        train={"steps": 12000}, rope={"input_px": 160},
+        ablation={"steps": 2000}, sigmas=(1.0, 2.0, 4.0, 8.0, 16.0),
+        evaluate={"pairs": 500, "points": 625},
+    ),
+}  # fmt: skip
+
+
+def digest(config: Config) -> str:
+    """Eight hexadecimal digits that differ where any field of the configuration differs."""
+    text = json.dumps(dataclasses.asdict(config), sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:8]
+
+
+def from_dict(kind: type[Config], values: dict[str, Any]) -> Config:
+    """Build a configuration from stored values; an unknown key is a ValueError that names the accepted ones."""
+    known = [field.name for field in dataclasses.fields(kind)]
+    for key in values:
+        _check_choice(f"a key of {kind.__name__}", key, tuple(known))
+    return kind(**values)
+
+
+@dataclasses.dataclass(frozen=True)
+class Paths:
+    """Where a preset's files lie below the repository's root."""
+
+    root: Path
+    preset: str
+
+    @property
+    def generated(self) -> Path:
+        """Large and reproducible, ignored by git."""
+        return self.root / "data" / "generated" / self.preset
+
+    def dataset(self, object: str) -> Path:
+        """The rendered data set of one object."""
+        return self.generated / object
+
+    def model(self, config: TrainConfig) -> Path:
+        """The folder of one trained model."""
+        return self.generated / "models" / config.name
+
+    def queries(self, name: str) -> Path:
+        """The table of one method's answers, one row a query."""
+        return self.generated / "queries" / f"{name}.parquet"
+
+    @property
+    def results(self) -> Path:
+        """Small tables that figures, README and report read."""
+        return self.root / "data" / "results" / self.preset
+
+    @property
+    def figures(self) -> Path:
+        """The paper's figures as this preset draws them."""
+        return self.root / "figures" / self.preset
+
+
+def find_root(start: Path | None = None) -> Path:
+    """The repository's root: the nearest folder upwards that holds ``environment.lock``, or MMGSD_ROOT.
+
+    Raises FileNotFoundError where neither is found.
+    """
+    if "MMGSD_ROOT" in os.environ:
+        return Path(os.environ["MMGSD_ROOT"])
+    start = Path.cwd() if start is None else start
+    for folder in (start, *start.parents, *Path(__file__).resolve().parents):
+        if (folder / "environment.lock").is_file():
+            return folder
+    raise FileNotFoundError("no environment.lock in this folder or above it: set MMGSD_ROOT to the repository")

@@ -1,0 +1,214 @@
+"""The data set on disk: its format, its checker and reader, and how pairs of images are drawn from it.
+
+    dataset.json      object, image size, symmetry groups, seed, versions, number of images of each split
+    labels.parquet    one row an image: file, mask, split, episode, view, xy, visible, intrinsics, camera_pose, state …
+    images/*.webp     lossless colour images          masks/*.png    1-bit object masks
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from PIL import Image, UnidentifiedImageError
+
+from mmgsd.config import N_POINTS
+from mmgsd.symmetry import SymmetryGroup
+
+FORMAT = 1
+SPLITS = ("train", "test")
+REQUIRED_COLUMNS = ("file", "mask", "split", "episode", "view", "xy", "visible", "intrinsics", "camera_pose")
+REQUIRED_KEYS = ("format", "object", "size", "symmetry", "default_group", "config", "images", "versions")
+
+
+class DatasetError(ValueError):
+    """A data set's file is missing, truncated or not of the format; the message names the file."""
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """One split of a data set, labels in memory, images read when asked for.
+
+    ``xy`` (N, 625, 2) px, ``visible`` (N, 625) bool, ``episode`` (N,) simulation of each image.
+    """
+
+    folder: Path
+    split: str
+    info: dict
+    labels: pd.DataFrame
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    @property
+    def object(self) -> str:
+        """Name of the object, e.g. ``cloth``."""
+        return self.info["object"]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) of every image in px."""
+        return tuple(self.info["size"])
+
+    @cached_property
+    def xy(self) -> np.ndarray:
+        """(N, 625, 2) float32 px, the projected material points."""
+        return np.stack([np.reshape(v, (-1, 2)) for v in self.labels.xy]).astype(np.float32)
+
+    @cached_property
+    def visible(self) -> np.ndarray:
+        """(N, 625) bool, points that the camera sees."""
+        return np.stack(self.labels.visible.to_list()).astype(bool)
+
+    @cached_property
+    def episode(self) -> np.ndarray:
+        """(N,) int, the simulation that each image shows."""
+        return self.labels.episode.to_numpy()
+
+    def group(self, name: str = "") -> SymmetryGroup:
+        """The stored symmetry group of that name ("" is the object's own); ValueError names those stored."""
+        name, stored = name or self.info["default_group"], self.info["symmetry"]
+        if name not in stored:
+            raise ValueError(f"group must be one of {', '.join(map(repr, stored))} for this data set, got {name!r}")
+        return SymmetryGroup(name, np.asarray(stored[name]))
+
+    def load_image(self, index: int) -> np.ndarray:
+        """(H, W, 3) uint8; DatasetError where the file is missing, truncated or of another size."""
+        return np.asarray(_open_image(self.folder / self.labels.file.iloc[index], self.size).convert("RGB"))
+
+    def load_mask(self, index: int) -> np.ndarray:
+        """(H, W) bool, True on the object."""
+        return np.asarray(_open_image(self.folder / self.labels["mask"].iloc[index], self.size).convert("1"))
+
+
+def load_dataset(folder: Path | str, split: str = "train") -> Dataset:
+    """Open one split after checking the table against the format and every named file's presence.
+
+    Raises FileNotFoundError where there is no data set, ValueError for an unknown split, DatasetError (which names
+    the file) for one that is damaged. ``check_dataset`` also decodes every image.
+    """
+    folder = Path(folder)
+    if split not in SPLITS:
+        raise ValueError(f"split must be one of {SPLITS}, got {split!r}")
+    info = _read_info(folder / "dataset.json")
+    labels = _read_labels(folder / "labels.parquet", info)
+    for name in [*labels.file, *labels["mask"]]:
+        if not (folder / name).is_file():
+            raise DatasetError(f"{folder / name} is missing: render the data set again with overwrite=True")
+    return Dataset(folder, split, info, labels[labels.split == split].reset_index(drop=True))
+
+
+def check_dataset(folder: Path | str) -> pd.DataFrame:
+    """Decode every image and mask and test every label; returns a table of what was checked, one row a check.
+
+    Raises DatasetError at the first violation, with the file's name.
+    """
+    rows = []
+    for split in SPLITS:
+        data = load_dataset(folder, split)
+        for index in range(len(data)):
+            data.load_image(index)
+            mask = data.load_mask(index)
+            _check_labels_on_mask(data, index, mask)
+        rows.append({"split": split, "images": len(data), "visible points": round(float(data.visible.mean()), 3)})
+    train, test = (set(load_dataset(folder, split).episode) for split in SPLITS)
+    if train & test:
+        raise DatasetError(f"{folder}: simulations {sorted(train & test)[:5]} are in both splits")
+    return pd.DataFrame(rows).set_index("split")
+
+
+def sample_pairs(
+    episode: np.ndarray, n_pairs: int, rng: np.random.Generator, *, same_episode: bool = False
+) -> np.ndarray:
+    """Draw ``n_pairs`` ordered pairs of different images, of different simulations unless ``same_episode``.
+
+    Returns (n_pairs, 2) int; without repetition while the images suffice. ValueError where no pair exists.
+    """
+    first, second = np.nonzero(~np.eye(len(episode), dtype=bool))
+    if not same_episode and len(np.unique(episode)) > 1:
+        keep = episode[first] != episode[second]
+        first, second = first[keep], second[keep]
+    if len(first) == 0:
+        raise ValueError(f"episode must hold at least 2 images to make a pair, got {len(episode)}")
+    picked = rng.choice(len(first), n_pairs, replace=n_pairs > len(first))
+    return np.stack([first[picked], second[picked]], axis=1)
+
+
+def encode_image(image: np.ndarray) -> bytes:
+    """Lossless WebP bytes of an (H, W, 3) uint8 image; the same pixels always give the same bytes."""
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, "WEBP", lossless=True, quality=0, method=0)
+    return buffer.getvalue()
+
+
+def encode_mask(mask: np.ndarray) -> bytes:
+    """1-bit PNG bytes of an (H, W) bool mask."""
+    buffer = io.BytesIO()
+    Image.fromarray(mask).save(buffer, "PNG")
+    return buffer.getvalue()
+
+
+def _open_image(path: Path, size: tuple[int, int]) -> Image.Image:
+    try:
+        image = Image.open(path)
+        image.load()
+    except (OSError, UnidentifiedImageError, SyntaxError) as error:
+        raise DatasetError(f"{path} is missing, truncated or no image: {error}") from error
+    if image.size != size:
+        raise DatasetError(f"{path} is {image.size[0]} x {image.size[1]} px, dataset.json says {size[0]} x {size[1]}")
+    return image
+
+
+def _read_info(path: Path) -> dict:
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} does not exist: no data set here, or one that is still being rendered")
+    try:
+        info = json.loads(path.read_text())
+    except ValueError as error:
+        raise DatasetError(f"{path} is no JSON: {error}") from error
+    missing = [key for key in REQUIRED_KEYS if key not in info]
+    if missing:
+        raise DatasetError(f"{path} lacks the keys {missing}")
+    if info["format"] != FORMAT:
+        raise DatasetError(f"{path} has format {info['format']!r}, this version reads {FORMAT}")
+    return info
+
+
+def _read_labels(path: Path, info: dict) -> pd.DataFrame:
+    try:
+        labels = pd.read_parquet(path)
+    except (OSError, ValueError) as error:  # pyarrow's errors are among these
+        raise DatasetError(f"{path} is missing, truncated or no Parquet table: {error}") from error
+    missing = [name for name in REQUIRED_COLUMNS if name not in labels]
+    if missing:
+        raise DatasetError(f"{path} lacks the columns {missing}")
+    counts = labels.split.value_counts().to_dict()
+    if counts != info["images"]:
+        raise DatasetError(f"{path} has {counts} rows a split, dataset.json says {info['images']}")
+    for column, length in {"xy": 2 * N_POINTS, "visible": N_POINTS, "intrinsics": 9, "camera_pose": 16}.items():
+        wrong = labels.index[labels[column].map(np.size) != length]
+        if len(wrong):
+            raise DatasetError(f"{path}: {column} of row {wrong[0]} is not of length {length}")
+    if not np.isfinite(np.stack(labels.xy.to_list())).all():
+        raise DatasetError(f"{path}: xy holds values that are not finite")
+    return labels
+
+
+def _check_labels_on_mask(data: Dataset, index: int, mask: np.ndarray) -> None:
+    """Visible points must lie on the object, but for a few at its very edge."""
+    name, (width, height) = data.labels["mask"].iloc[index], data.size
+    xy, visible = data.xy[index], data.visible[index]
+    if not visible.any():
+        raise DatasetError(f"{data.folder / name}: no material point is visible")
+    column, row = np.rint(xy[visible]).astype(int).T
+    if column.min() < 0 or row.min() < 0 or column.max() >= width or row.max() >= height:
+        raise DatasetError(f"{data.folder / 'labels.parquet'}: a visible point of {name} lies outside the image")
+    padded = np.pad(mask, 2)
+    near = np.any([padded[row + dy, column + dx] for dy in range(5) for dx in range(5)], axis=0)
+    if near.mean() < 0.98:
+        raise DatasetError(f"{data.folder / name}: {np.sum(~near)} of {near.size} visible points lie off the mask")

@@ -1,0 +1,185 @@
+"""The evaluation stage: the same questions for every method, answered into one table of queries each."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import torch
+from torch import Tensor
+from tqdm.auto import tqdm
+
+from mmgsd.baselines import compute_baseline_heatmap
+from mmgsd.config import N_POINTS, EvaluateConfig
+from mmgsd.dataset import Dataset, load_dataset, sample_pairs
+from mmgsd.matching import Matcher, compute_entropy, fit_modes
+from mmgsd.metrics import aggregate, compute_query_errors
+from mmgsd.network import compute_cell_centres
+
+BASELINES = ("sift", "orb")
+CHANCE = ("centre", "random")
+BASELINE_STRIDE = 8  # px between the candidates that classical descriptors are compared at
+BANDWIDTHS = (1 / 64, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2)  # of a contrastive heatmap, in margins
+
+Answer = Callable[[int, int, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+
+def evaluate_model(
+    weights: Path, dataset: Path, config: EvaluateConfig, out: Path, *,
+    group: str = "", overwrite: bool = False, progress: bool = True,
+) -> Path:  # fmt: skip
+    """Ask a trained model all queries and write the table ``out`` (Parquet); a finished one is returned as it is.
+
+    The true matches are those of ``group`` ("" is the object's own), whatever the model was taught.
+    """
+    if out.is_file() and not overwrite:
+        return out
+    matcher, data = Matcher.load(weights), load_dataset(dataset, "test")
+    return _write(_ask(_model_answer(matcher, data), data, config, group, progress, out.stem), out)
+
+
+def evaluate_baseline(
+    method: str, dataset: Path, config: EvaluateConfig, out: Path, *,
+    group: str = "", overwrite: bool = False, progress: bool = True,
+) -> Path:  # fmt: skip
+    """Ask ``sift``, ``orb``, or chance (``centre``, ``random``) the same queries; ValueError for another method."""
+    if method not in BASELINES + CHANCE:
+        raise ValueError(f"method must be one of {BASELINES + CHANCE}, got {method!r}")
+    if out.is_file() and not overwrite:
+        return out
+    data = load_dataset(dataset, "test")
+    answer = _chance_answer(method, data) if method in CHANCE else _classical_answer(method, data)
+    return _write(_ask(answer, data, config, group, progress, out.stem), out)
+
+
+def load_queries(path: Path) -> pd.DataFrame:
+    """One method's table: pair, image0, image1, point, visible, n, rmse_px, nearest_px, entropy, pck@…"""
+    return pd.read_parquet(path)
+
+
+def summarise(tables: dict[str, Path]) -> dict[str, dict[str, float]]:
+    """{method: {metric: value}} over queries with a visible source, and over all of them with the suffix ``_all``."""
+    summary = {}
+    for method, path in tables.items():
+        queries = load_queries(path)
+        everything = {f"{name}_all": value for name, value in aggregate(queries).items()}
+        summary[method] = aggregate(queries[queries.visible]) | everything
+    return summary
+
+
+def write_results(results: dict, path: Path) -> Path:
+    """Write nested results as JSON, aside and then renamed."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    aside = path.with_suffix(".tmp")
+    aside.write_text(json.dumps(results, indent=1) + "\n")
+    os.replace(aside, path)
+    return path
+
+
+def calibrate_bandwidth(matcher: Matcher, data: Dataset, *, pairs: int = 16, points: int = 40, seed: int = 0) -> float:
+    """The heatmap bandwidth with the least mean error on training pairs: contrastive descriptors have no scale.
+
+    Leaves it set on the matcher and returns it (descriptor units).
+    """
+    config, errors = EvaluateConfig(pairs=pairs, points=points, seed=seed), {}
+    images = np.unique(sample_pairs(data.episode, pairs, np.random.default_rng(seed)))
+    descriptors = _describe(matcher, data, images)
+    for bandwidth in (matcher.config.margin * b for b in BANDWIDTHS):
+        matcher.bandwidth = bandwidth
+        queries = _ask(_model_answer(matcher, data, descriptors), data, config, matcher.config.group, False, "")
+        errors[bandwidth] = queries.rmse_px[queries.visible].mean()
+    matcher.bandwidth = min(errors, key=errors.get)
+    return matcher.bandwidth
+
+
+def choose_points(count: int) -> np.ndarray:
+    """``count`` material points of 625 spread evenly in order; all of them at 625."""
+    return np.unique(np.linspace(0, N_POINTS - 1, count).round().astype(int))
+
+
+def _ask(answer: Answer, data: Dataset, config: EvaluateConfig, group: str, progress: bool, name: str) -> pd.DataFrame:
+    """Ask ``answer`` every query and compare with the truth; one row a query."""
+    pairs = sample_pairs(data.episode, config.pairs, np.random.default_rng(config.seed))
+    symmetry, points = data.group(group), choose_points(config.points)
+    orbits = [symmetry.distinct_modes(int(p)) for p in points]
+    count = np.array([len(o) for o in orbits])
+    frames = []
+    for pair, (first, second) in enumerate(tqdm(pairs, desc=f"evaluate {name}", disable=not progress, leave=False)):
+        modes, entropy = answer(first, second, data.xy[first, points], count)
+        frame = pd.DataFrame({"pair": pair, "image0": first, "image1": second, "point": points})
+        frame = frame.assign(visible=data.visible[first, points], n=count, entropy=entropy)
+        for n in np.unique(count):
+            rows = np.flatnonzero(count == n)
+            true = data.xy[second][np.stack([orbits[r] for r in rows])]
+            for column, values in compute_query_errors(modes[rows, :n], true).items():
+                frame.loc[rows, column] = values
+        frames.append(frame)
+    return pd.concat(frames, ignore_index=True)
+
+
+def _model_answer(matcher: Matcher, data: Dataset, descriptors: dict[int, Tensor] | None = None) -> Answer:
+    descriptors = _describe(matcher, data, np.arange(len(data))) if descriptors is None else descriptors
+
+    def answer(first: int, second: int, xy: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        heatmap = matcher.compute_heatmaps(descriptors[first], descriptors[second], torch.from_numpy(xy), data.size)
+        return _fit(heatmap, n, compute_cell_centres(data.size, heatmap.shape[-2:]))
+
+    return answer
+
+
+def _classical_answer(method: str, data: Dataset) -> Answer:
+    images = [data.load_image(i) for i in range(len(data))]
+    masks = [data.load_mask(i) for i in range(len(data))]
+
+    def answer(first: int, second: int, xy: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        heatmap, grid = compute_baseline_heatmap(
+            images[first], images[second], xy, masks[second], method=method, stride=BASELINE_STRIDE
+        )
+        xs, ys = grid[0, :, 0], grid[:, 0, 1]
+        return _fit(torch.from_numpy(heatmap), n, (torch.from_numpy(xs), torch.from_numpy(ys)))
+
+    return answer
+
+
+def _chance_answer(method: str, data: Dataset) -> Answer:
+    """All modes at the centre of the object's pixels, or each at a random one of them."""
+    pixels = [np.argwhere(data.load_mask(i))[:, ::-1].astype(float) for i in range(len(data))]
+    rng = np.random.default_rng(0)
+
+    def answer(first: int, second: int, xy: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        shape, on_object = (len(xy), n.max()), pixels[second]
+        centre = np.broadcast_to(on_object.mean(0), (*shape, 2))
+        modes = centre if method == "centre" else on_object[rng.integers(len(on_object), size=shape)]
+        return modes, np.full(len(xy), np.log(len(on_object)))
+
+    return answer
+
+
+def _fit(heatmap: Tensor, n: np.ndarray, cells: tuple[Tensor, Tensor]) -> tuple[np.ndarray, np.ndarray]:
+    xs, ys = (c.float().to(heatmap.device) for c in cells)
+    fit = fit_modes(heatmap, torch.from_numpy(n).to(heatmap.device), xs, ys)
+    entropy = compute_entropy(heatmap.flatten(1), float((xs[1] - xs[0]) * (ys[1] - ys[0])))
+    return fit.modes.cpu().numpy(), entropy.cpu().numpy()
+
+
+def _describe(matcher: Matcher, data: Dataset, indices: np.ndarray, *, batch: int = 16) -> dict[int, Tensor]:
+    """Descriptors (D, h, w) of the images, computed once each."""
+    return dict(_describe_batches(matcher, data, indices, batch))
+
+
+def _describe_batches(matcher: Matcher, data: Dataset, indices: np.ndarray, batch: int) -> Iterator[tuple[int, Tensor]]:
+    for start in range(0, len(indices), batch):
+        chosen = indices[start : start + batch]
+        yield from zip(chosen.tolist(), matcher.describe([data.load_image(i) for i in chosen]), strict=True)
+
+
+def _write(table: pd.DataFrame, out: Path) -> Path:
+    out.parent.mkdir(parents=True, exist_ok=True)
+    aside = out.with_suffix(".tmp")
+    table.to_parquet(aside, index=False)
+    os.replace(aside, out)
+    return out

@@ -1,0 +1,55 @@
+"""Errors of predicted modes, one row a query; aggregation is separate."""
+
+from __future__ import annotations
+
+from itertools import permutations
+
+import numpy as np
+import pandas as pd
+from scipy.optimize import linear_sum_assignment
+
+PCK_PX = (5, 10, 20)
+
+
+def compute_mode_errors(modes: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """Distances in px (S, n) of true modes to the predicted ones assigned to them with least total squared error.
+
+    ``modes`` and ``true`` (S, n, 2) px. Raises ValueError where the shapes differ.
+    """
+    if modes.shape != true.shape or modes.ndim != 3:
+        raise ValueError(f"modes and true must share one shape (S, n, 2), got {modes.shape} and {true.shape}")
+    squared = np.square(true[:, :, None] - modes[:, None]).sum(-1)  # (S, true, predicted)
+    n = true.shape[1]
+    if n <= 4:
+        orders = np.array(list(permutations(range(n))))  # (n!, n)
+        costs = squared[:, np.arange(n), orders].sum(-1)  # (S, n!)
+        assigned = orders[costs.argmin(1)]
+    else:
+        assigned = np.array([linear_sum_assignment(cost)[1] for cost in squared], dtype=int).reshape(-1, n)
+    return np.sqrt(np.take_along_axis(squared, assigned[..., None], 2)[..., 0])
+
+
+def compute_query_errors(modes: np.ndarray, true: np.ndarray) -> dict[str, np.ndarray]:
+    """Per-query metrics of (S, n, 2) modes, most probable first: each value (S,).
+
+    ``rmse_px`` is the root mean square over a query's modes (the paper's formula lacks the root of its name),
+    ``nearest_px`` the distance of the most probable mode to the nearest true one, ``pck@5px`` … the share of true
+    modes found that near.
+    """
+    errors = compute_mode_errors(modes, true)
+    nearest = np.linalg.norm(true - modes[:, :1], axis=-1).min(1)
+    shares = {f"pck@{t}px": (errors <= t).mean(1) for t in PCK_PX}
+    return {"rmse_px": np.sqrt(np.square(errors).mean(1)), "nearest_px": nearest, **shares}
+
+
+def aggregate(queries: pd.DataFrame) -> dict[str, float]:
+    """Summary of a table of queries: ``rmse_mean``, ``rmse_pooled``, ``median`` (px), nearest and shares."""
+    error = queries.rmse_px
+    summary = {
+        "rmse_mean": error.mean(),
+        "rmse_pooled": np.sqrt(np.square(error).mean()),
+        "median": error.median(),
+        "nearest_mean": queries.nearest_px.mean(),
+        **{f"pck@{t}px": queries[f"pck@{t}px"].mean() for t in PCK_PX},
+    }
+    return {name: round(float(value), 4) for name, value in summary.items()} | {"queries": len(queries)}

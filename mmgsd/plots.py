@@ -1,0 +1,280 @@
+"""One function a figure: each returns a matplotlib ``Figure`` and neither shows nor saves it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pandas as pd
+from matplotlib import colormaps
+from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from scipy.ndimage import gaussian_filter1d
+
+from mmgsd.config import N_POINTS
+from mmgsd.drawing import (
+    COLUMN_IN,
+    MARK,
+    METHOD_COLOURS,
+    METHOD_LABELS,
+    PAGE_IN,
+    add_legend,
+    blend_heatmap,
+    check_filled,
+    compute_point_colours,
+    fade_image,
+    finish_axes,
+    get_line_style,
+    make_grid,
+    mark_pixel,
+    show_answer,
+    show_source,
+    styled,
+)
+from mmgsd.matching import Match
+
+DENSITY_STEP, SEGMENTS = 0.25, 25  # % of the object's size between points of a density; segments of a rope
+
+
+@styled
+def plot_match(match: Match, index: int = 0) -> Figure:
+    """Source image with the pixel of one query, target image with heatmap and modes; the title gives the entropy.
+
+    Each mode has its 1-std ellipse, its marker's area shows its weight. ValueError where ``index`` is not in [0, S).
+    """
+    if not 0 <= index < len(match.xy):
+        raise ValueError(f"index must be in [0, {len(match.xy)}), got {index!r}")
+    figure, axes = make_grid([match.image0.shape[0] / match.image0.shape[1]], 2, PAGE_IN * 0.7)
+    show_source(axes[0, 0], match, index)
+    show_answer(axes[0, 1], match, index)
+    axes[0, 0].set_title("Source")
+    axes[0, 1].set_title(f"Matches · entropy {match.entropy[index]:.1f} nats")
+    return figure
+
+
+@styled
+def plot_teaser(matches: Mapping[str, Sequence[Match]]) -> Figure:
+    """A row an object ({object: matches}): source, target, and heatmap with modes of each match's first query."""
+    check_filled("matches", matches)
+    blocks = max(len(row) for row in matches.values())
+    aspects = [_get_aspect(row[0]) for row in matches.values()]
+    figure, axes = make_grid(aspects, 3 * blocks, COLUMN_IN if blocks == 1 else PAGE_IN)
+    for line, (name, row) in zip(axes, matches.items(), strict=True):
+        line[0].set_ylabel(name.capitalize())
+        for block, match in enumerate(row):
+            source, target, answer = line[3 * block : 3 * block + 3]
+            show_source(source, match, 0)
+            target.imshow(match.image1)
+            show_answer(answer, match, 0)
+    for column, axis in enumerate(axes[0]):
+        axis.set_title(("Source", "Target", "Matches")[column % 3])
+    return figure
+
+
+@styled
+def plot_combined(
+    answers: Mapping[str, Mapping[str, Match]], true: Mapping[str, np.ndarray], inwards: Mapping[str, Match],
+    *, sigma_px: float = 10.0,
+) -> Figure:  # fmt: skip
+    """A: contrastive answers, B: the true and MMGSD's distribution of the same query, C: queries moved inwards.
+
+    ``answers`` {object: {"pcl", "spcl", "mmgsd": match}}, first query of each; ``true`` {object: (n, 2) px}, drawn as
+    Gaussians of ``sigma_px``, wide enough to be seen; ``inwards`` {object: match of four queries, extremity first}.
+    """
+    check_filled("answers", answers)
+    for name, match in inwards.items():
+        if len(match.xy) != 4:
+            raise ValueError(f"inwards[{name!r}] must hold 4 queries, got {len(match.xy)}")
+    aspects = [_get_aspect(m["mmgsd"]) for m in answers.values()] + [_get_aspect(m) for m in inwards.values()]
+    figure, axes = make_grid(aspects, 5, PAGE_IN)
+    for line, (name, methods) in zip(axes, answers.items(), strict=False):
+        _draw_comparison(line, methods, true[name], sigma_px)
+        line[0].set_ylabel(name.capitalize())
+    for line, (name, match) in zip(axes[len(answers) :], inwards.items(), strict=True):
+        _draw_inwards(line, match)
+        line[0].set_ylabel(name.capitalize())
+    for axis, title in zip(axes[0], (r"$\bf{A}$  Source", "PCL", "SPCL", r"$\bf{B}$  True", "MMGSD"), strict=True):
+        axis.set_title(title)
+    if inwards:
+        axes[len(answers), 0].set_title(r"$\bf{C}$  Sources 1–4")
+    return figure
+
+
+@styled
+def plot_rmse_pdf(tables: Mapping[str, Mapping[str, pd.DataFrame]], object_sizes_px: Mapping[str, float]) -> Figure:
+    """Probability density of the error of a query with a visible source, as a percentage of the object's size.
+
+    ``tables`` {object: {method: queries}}, a panel an object, a line a method, chance dashed. The object's size is the
+    diagonal of its bounding box, mean over the test images (``compute_object_size``). Smoothed with a std of 1 %.
+    """
+    for name, methods in {"": tables, **tables}.items():
+        check_filled(f"tables[{name!r}]" if name else "tables", methods)
+    figure, axes = plt.subplots(len(tables), 1, figsize=(COLUMN_IN, 0.4 + 1.4 * len(tables)), layout="constrained",
+                                sharex=True, squeeze=False)  # fmt: skip
+    far = 0.0
+    for axis, (name, methods) in zip(axes[:, 0], tables.items(), strict=True):
+        for method, queries in methods.items():
+            percent = 100 * queries.rmse_px[queries.visible].to_numpy() / object_sizes_px[name]
+            axis.plot(*compute_density(percent), **get_line_style(method))
+            far = max(far, float(np.quantile(percent, 0.99)))
+        axis.set(title=name.capitalize(), ylabel="Density per %", ylim=(0, None))
+    axes[-1, 0].set(xlabel="Error (% of the object's bounding-box diagonal)", xlim=(0, far))
+    add_legend(figure, axes[:, 0])
+    return finish_axes(figure)
+
+
+@styled
+def plot_spatial_rmse(
+    tables: Mapping[str, Mapping[str, pd.DataFrame]], *, mapped: Sequence[str] = ("mmgsd", "spcl")
+) -> Figure:
+    """Mean error over the rope's length for every method (1-D), and over the cloth's area for those ``mapped`` (2-D).
+
+    ``tables`` {"rope", "cloth": {method: queries}}; the maps share one scale, points never asked stay grey.
+    """
+    for name in ("rope", "cloth"):
+        check_filled(f"tables[{name!r}]", tables.get(name, {}))
+    figure, axes = plt.subplots(1, 1 + len(mapped), figsize=(PAGE_IN, 2.1), layout="constrained",
+                                width_ratios=[2.0] + [1.0] * len(mapped))  # fmt: skip
+    for method, queries in tables["rope"].items():
+        errors = compute_point_errors(queries)
+        seen = np.flatnonzero(np.isfinite(errors))
+        mean = pd.Series(errors[seen]).groupby(seen * SEGMENTS // N_POINTS).mean()
+        axes[0].plot((mean.index + 0.5) * 100 / SEGMENTS, mean, **get_line_style(method))
+    axes[0].set(title="Rope", xlabel="Position along the rope (%)", ylabel="RMSE (px)", xlim=(0, 100), ylim=(0, None))
+    maps = [compute_point_errors(tables["cloth"][method]).reshape(25, 25) for method in mapped]
+    for axis, method, values in zip(axes[1:], mapped, maps, strict=True):
+        image = axis.imshow(values, cmap=colormaps["viridis"].with_extremes(bad="0.85"), vmin=0, vmax=np.nanmax(maps))
+        axis.set(title=f"Cloth · {METHOD_LABELS[method]}", xticks=[0, 12, 24], yticks=[0, 12, 24])
+    axes[1].set(xlabel="Column of the grid", ylabel="Row of the grid")
+    figure.colorbar(image, ax=axes[1:], label="RMSE (px)", shrink=0.8)
+    add_legend(figure, axes[:1])
+    return finish_axes(figure, keep_box=axes[1:])
+
+
+@styled
+def plot_sigma_ablation(results: Mapping[str, Mapping[str, Mapping[str, float]]]) -> Figure:
+    """``rmse_mean`` of MMGSD against the std σ of its targets: ``results`` {object: {σ px: {metric: value}}}."""
+    for name, rows in {"": results, **results}.items():
+        check_filled(f"results[{name!r}]" if name else "results", rows)
+    figure, axes = plt.subplots(1, len(results), figsize=(COLUMN_IN, 1.7), layout="constrained", squeeze=False)
+    for axis, (name, rows) in zip(axes[0], results.items(), strict=True):
+        points = sorted((float(sigma), metrics["rmse_mean"]) for sigma, metrics in rows.items())
+        sigma, error = zip(*points, strict=True)
+        axis.plot(sigma, error, "o-", ms=3.5, color=METHOD_COLOURS["mmgsd"])
+        for x, y in points:
+            axis.annotate(f"{y:.1f}", (x, y), xytext=(0, 4), textcoords="offset points", ha="center", fontsize=6.5)
+        axis.set_xscale("log", base=2)
+        axis.set_xticks(sigma, [f"{s:g}" for s in sigma])
+        axis.set(title=name.capitalize(), xlabel="Std σ of a target mode (px)")
+        axis.margins(x=0.15, y=0.25)
+    axes[0, 0].set_ylabel("RMSE of MMGSD (px)")
+    return finish_axes(figure)
+
+
+@styled
+def plot_training(logs: Mapping[str, pd.DataFrame], *, columns: int = 4) -> Figure:
+    """Loss against step, a panel a model: ``logs`` {"cloth mmgsd": columns step, loss, seconds}, last word the method.
+
+    Losses of different methods have different scales. Dark: mean of a tenth of the steps.
+    """
+    check_filled("logs", logs)
+    columns = min(columns, len(logs))
+    rows = -(-len(logs) // columns)
+    figure, axes = plt.subplots(rows, columns, figsize=(PAGE_IN * columns / 4, 1.5 * rows), layout="constrained",
+                                squeeze=False)  # fmt: skip
+    for axis, (name, log) in zip(axes.flat, logs.items(), strict=False):
+        colour = METHOD_COLOURS.get(name.split()[-1], "0.3")
+        axis.plot(log.step, log.loss, color=colour, alpha=0.3, lw=0.6)
+        axis.plot(log.step, log.loss.rolling(max(1, len(log) // 10), min_periods=1).mean(), color=colour)
+        title = " ".join(METHOD_LABELS.get(word, word.capitalize()) for word in name.split())
+        axis.set(title=f"{title} · {log.seconds.iloc[-1] / 60:.1f} min", xlabel="Step")
+    for axis in axes[:, 0]:
+        axis.set_ylabel("Loss")
+    for axis in axes.flat[len(logs) :]:
+        axis.remove()
+    return finish_axes(figure)
+
+
+@styled
+def plot_samples(images: Sequence[np.ndarray], titles: Sequence[str] | None = None, *, columns: int = 6) -> Figure:
+    """Contact sheet of (H, W, 3) images of one size. ValueError where there are none, or not one title each."""
+    check_filled("images", images)
+    if titles is not None and len(titles) != len(images):
+        raise ValueError(f"titles must be {len(images)}, one an image, got {len(titles)}")
+    aspect = images[0].shape[0] / images[0].shape[1]
+    figure, axes = make_grid([aspect] * -(-len(images) // columns), columns, PAGE_IN)
+    for axis, image, title in zip(axes.flat, images, titles or [""] * len(images), strict=False):
+        axis.imshow(image)
+        axis.set_title(title)
+    for axis in axes.flat[len(images) :]:
+        axis.remove()
+    return figure
+
+
+@styled
+def plot_labels(
+    image: np.ndarray, xy: np.ndarray, visible: np.ndarray, *, object: str = "cloth", orbit: Sequence[int] = ()
+) -> Figure:
+    """Image, and its material points ``xy`` (P, 2) px coloured by place on the object, hidden ones hollow.
+
+    The points of an ``orbit`` are ringed on both. ValueError where ``visible`` is not (P,).
+    """
+    if xy.ndim != 2 or visible.shape != xy.shape[:1] or not len(xy):
+        raise ValueError(f"xy must be (P, 2) and visible (P,), P > 0, got {xy.shape} and {visible.shape}")
+    figure, axes = make_grid([image.shape[0] / image.shape[1]], 2, PAGE_IN * 0.7)
+    colours = compute_point_colours(object, len(xy))
+    axes[0, 0].imshow(image)
+    axes[0, 1].imshow(fade_image(image))
+    axes[0, 1].scatter(*xy[~visible].T, s=4, facecolors="none", edgecolors=colours[~visible], linewidths=0.4)
+    axes[0, 1].scatter(*xy[visible].T, s=4, c=colours[visible], linewidths=0)
+    for axis in axes[0]:
+        chosen = xy[list(orbit)].reshape(-1, 2)
+        axis.scatter(*chosen.T, s=50, facecolors="none", edgecolors="black", linewidths=2.2)
+        axis.scatter(*chosen.T, s=50, facecolors="none", edgecolors=MARK, linewidths=1.2)
+    return figure
+
+
+def compute_object_size(masks: Sequence[np.ndarray]) -> float:
+    """Diagonal of the object's bounding box in px, mean over (H, W) bool masks."""
+    check_filled("masks", masks)
+    spans = [np.ptp(np.argwhere(mask), axis=0) + 1 for mask in masks]
+    return float(np.linalg.norm(spans, axis=1).mean())
+
+
+def compute_density(percent: np.ndarray, *, bandwidth: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    """Centres (K,) and density (K,) of (N,) errors ≥ 0: a histogram smoothed by a Gaussian, mirrored at zero."""
+    check_filled("percent", percent)
+    edges = np.arange(0, percent.max() + 5 * bandwidth + DENSITY_STEP, DENSITY_STEP)
+    share = np.histogram(percent, edges)[0] / (len(percent) * DENSITY_STEP)
+    return edges[:-1] + DENSITY_STEP / 2, gaussian_filter1d(share, bandwidth / DENSITY_STEP, mode="reflect")
+
+
+def compute_point_errors(queries: pd.DataFrame) -> np.ndarray:
+    """(625,) mean ``rmse_px`` of each material point as a visible source, NaN where it never was one."""
+    mean = queries[queries.visible].groupby("point").rmse_px.mean()
+    return mean.reindex(range(N_POINTS)).to_numpy(float)
+
+
+def _draw_comparison(line: Sequence[Axes], methods: Mapping[str, Match], true: np.ndarray, sigma_px: float) -> None:
+    match = methods["mmgsd"]
+    show_source(line[0], match, 0)
+    for axis, method in zip(line[[1, 2, 4]], ("pcl", "spcl", "mmgsd"), strict=True):
+        show_answer(axis, methods[method], 0, modes=False)
+    ys, xs = np.mgrid[: match.image1.shape[0], : match.image1.shape[1]]
+    mixture = sum(np.exp(-((xs - x) ** 2 + (ys - y) ** 2) / (2 * sigma_px**2)) for x, y in true)
+    line[3].imshow(blend_heatmap(match.image1, mixture))
+
+
+def _draw_inwards(line: Sequence[Axes], match: Match) -> None:
+    line[0].imshow(match.image0)
+    for index, (x, y) in enumerate(match.xy):
+        mark_pixel(line[0], x, y)
+        line[0].annotate(str(index + 1), (x, y), xytext=(3, 3), textcoords="offset points", color="black",
+                         bbox={"boxstyle": "circle,pad=0.1", "fc": MARK, "lw": 0}, fontsize=5.5)  # fmt: skip
+        show_answer(line[index + 1], match, index, modes=False)
+        line[index + 1].set_title(f"{index + 1} · {match.entropy[index]:.1f} nats")
+
+
+def _get_aspect(match: Match) -> float:
+    return match.image1.shape[0] / match.image1.shape[1]

@@ -1,0 +1,168 @@
+"""The rendering stage: episodes are independent tasks on Dask, each in a child process of its own.
+
+bpy is imported in these children only (``python -m mmgsd.scene``): a crash, a leak or a killed worker costs one batch.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import importlib.metadata
+import io
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pandas as pd
+from dask.distributed import Client, LocalCluster, as_completed
+from tqdm.auto import tqdm
+
+from mmgsd.config import DEFAULT_GROUP, RenderConfig
+from mmgsd.dataset import FORMAT, SPLITS, load_dataset
+from mmgsd.symmetry import GRID_GROUPS, LINE_GROUPS, load_group
+
+EPISODES_A_BATCH = 4  # a child process ends after so many, which bounds its memory
+GROUPS = {"cloth": GRID_GROUPS, "rope": LINE_GROUPS}
+
+
+class RenderError(RuntimeError):
+    """Blender failed in a child process; the message ends with what it said."""
+
+
+def render_dataset(
+    config: RenderConfig, folder: Path, *,
+    workers: int = 0, scheduler: str = "", overwrite: bool = False, progress: bool = True,
+) -> Path:  # fmt: skip
+    """Render the data set of ``config`` into ``folder`` and return it; a finished one is returned as it is.
+
+    ``workers`` processes on this machine (0: one a core), or the ``scheduler`` of an existing Dask cluster by its
+    address. Finished batches of a killed call are kept. ValueError where the folder holds another configuration.
+    """
+    if (folder / "dataset.json").is_file() and not overwrite:
+        _check_same_config(config, load_dataset(folder).info["config"], folder)
+        return folder
+    partial = folder.with_name(folder.name + ".partial")
+    if overwrite:
+        shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True, exist_ok=True)
+    _claim(config, partial)
+    missing = {name: job for name, job in plan_batches(config).items() if not (partial / f"{name}.zip").is_file()}
+    if missing:
+        with _connect(workers, scheduler) as client:
+            _render_batches(client, missing, partial, config, progress)
+    finished = _assemble(config, partial)
+    shutil.rmtree(folder, ignore_errors=True)
+    os.replace(finished, folder)
+    shutil.rmtree(partial)
+    return folder
+
+
+def plan_batches(config: RenderConfig) -> dict[str, dict]:
+    """The jobs of a data set by name; they depend on the configuration alone, never on who renders them."""
+    jobs = {}
+    for split, images in zip(SPLITS, (config.train_images, config.test_images), strict=True):
+        views = [min(config.views, images - start) for start in range(0, images, config.views)]
+        for start in range(0, len(views), EPISODES_A_BATCH):
+            episodes = [[start + i, n] for i, n in enumerate(views[start : start + EPISODES_A_BATCH])]
+            job = {"config": dataclasses.asdict(config), "split": split, "episodes": episodes}
+            jobs[f"{split}_{start:06d}"] = job
+    return jobs
+
+
+def render_batch(job: dict) -> bytes:
+    """Render one job in a child process and return its zip file; RenderError where the child fails."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "batch.zip"
+        path = os.pathsep.join([str(Path(__file__).resolve().parents[1]), os.environ.get("PYTHONPATH", "")])
+        # as many children as cores, so one thread in each
+        env = {"MMGSD_THREADS": "1", "OMP_NUM_THREADS": "1", **os.environ, "PYTHONPATH": path}
+        text = json.dumps({**job, "out": str(out)})
+        done = subprocess.run([sys.executable, "-m", "mmgsd.scene"], input=text, env=env, capture_output=True, text=True)
+        if done.returncode or not out.is_file():
+            raise RenderError(f"rendering {job['split']} {job['episodes']} failed:\n{done.stderr[-2000:]}")
+        return out.read_bytes()
+
+
+@contextlib.contextmanager
+def _connect(workers: int, scheduler: str) -> Iterator[Client]:
+    if scheduler:
+        with Client(scheduler) as client:
+            yield client
+        return
+    local = LocalCluster(
+        n_workers=workers or os.cpu_count(), threads_per_worker=1, host="127.0.0.1", dashboard_address=None,
+        silence_logs="ERROR",
+    )  # fmt: skip
+    with local, Client(local) as client:
+        yield client
+
+
+def _render_batches(client: Client, jobs: dict, partial: Path, config: RenderConfig, progress: bool) -> None:
+    futures = {client.submit(render_batch, job, pure=False, retries=2): name for name, job in jobs.items()}
+    total = sum(n for job in jobs.values() for _, n in job["episodes"])
+    with tqdm(total=total, desc=f"render {config.object}", unit="image", disable=not progress) as bar:
+        for future in as_completed(futures):
+            name = futures.pop(future)
+            aside = partial / f"{name}.tmp"
+            aside.write_bytes(future.result())
+            os.replace(aside, partial / f"{name}.zip")
+            bar.update(sum(n for _, n in jobs[name]["episodes"]))
+
+
+def _check_same_config(config: RenderConfig, stored: dict, folder: Path) -> None:
+    asked = dataclasses.asdict(config)
+    if stored != asked:
+        changed = [f"{k}: {stored.get(k)!r} there, {v!r} asked for" for k, v in asked.items() if stored.get(k) != v]
+        raise ValueError(f"{folder} holds another data set ({'; '.join(changed)}): use overwrite=True to replace it")
+
+
+def _claim(config: RenderConfig, partial: Path) -> None:
+    path = partial / "config.json"
+    if path.is_file():
+        _check_same_config(config, json.loads(path.read_text()), partial)
+    aside = path.with_suffix(".tmp")
+    aside.write_text(json.dumps(dataclasses.asdict(config)))
+    os.replace(aside, path)
+
+
+def _assemble(config: RenderConfig, partial: Path) -> Path:
+    """Unpack all batches into a folder of the data set's format, dataset.json last."""
+    folder = partial / "dataset"
+    shutil.rmtree(folder, ignore_errors=True)
+    for name in ("images", "masks"):
+        (folder / name).mkdir(parents=True)
+    rows = [row for name in plan_batches(config) for row in _unpack(partial / f"{name}.zip", folder)]
+    labels = pd.DataFrame(rows)
+    labels.to_parquet(folder / "labels.parquet", index=False)
+    groups = {name: load_group(config.object, name).permutations.tolist() for name in GROUPS[config.object]}
+    info = {
+        "format": FORMAT,
+        "object": config.object,
+        "size": list(config.size),
+        "default_group": DEFAULT_GROUP[config.object],
+        "images": labels.split.value_counts().to_dict(),
+        "config": dataclasses.asdict(config),
+        "versions": {name: importlib.metadata.version(name) for name in ("bpy", "numpy", "pillow")},
+        "symmetry": groups,
+    }
+    (folder / "dataset.json").write_text(json.dumps(info))
+    return folder
+
+
+def _unpack(path: Path, folder: Path) -> Iterator[dict]:
+    """Write a batch's files and yield its rows of labels; episodes of the test split are numbered after 1,000,000."""
+    with zipfile.ZipFile(io.BytesIO(path.read_bytes())) as batch:
+        for label in json.loads(batch.read("labels.json")):
+            split, stem = label["split"], f"{label['episode']:06d}_{label['view']:02d}"
+            names = {"file": f"images/{split}_{stem}.webp", "mask": f"masks/{split}_{stem}.png"}
+            (folder / names["file"]).write_bytes(batch.read(f"{stem}.webp"))
+            (folder / names["mask"]).write_bytes(batch.read(f"{stem}_mask.png"))
+            flat = {key: [v for row in label.pop(key) for v in row] for key in ("xy", "intrinsics", "camera_pose")}
+            label["episode"] += 1_000_000 * (split == "test")
+            yield {**names, **flat, **label.pop("info"), **label}

@@ -1,0 +1,272 @@
+"""A square cloth, dropped, pinned, dragged, picked up and folded over by Blender's cloth physics."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import bpy
+import numpy as np
+
+from mmgsd.config import RenderConfig
+from mmgsd.scene.render import DeformedObject, add_mesh, read_vertices
+
+SIDE = 49  # simulated vertices a side; every second one is a material point
+POINTS_SIDE = 25
+EXTENT = 1.0  # m
+SPACING = EXTENT / (SIDE - 1)
+VISIBILITY_RADIUS = 0.004  # m; less than the distance that self-collision keeps between two layers
+STATES = {"flat": 0.10, "wrinkled": 0.20, "folded": 0.20, "folded twice": 0.20, "corner": 0.15, "crumpled": 0.15}
+SETTLE_FRAMES = 8
+MAX_STRETCH = 1.22  # of the 99th percentile of edges
+MAX_HEIGHT = 0.17  # m
+
+
+@dataclass(frozen=True)
+class Grasp:
+    """A vertex and the way it is moved, one displacement (m) from its start for each frame; zeros pin it."""
+
+    vertex: int
+    path: np.ndarray  # (F, 3)
+
+
+def build_cloth(rng: np.random.Generator, config: RenderConfig) -> DeformedObject:
+    """Deform a cloth into a random state and add it, smoothly subdivided, to the current scene.
+
+    The 625 points are (25, 25) row-major vertices of the rendered surface itself; 1 m a side.
+    """
+    state = str(rng.choice(list(STATES), p=list(STATES.values())))
+    vertices, frames = deform(rng, state)
+    return hand_over(vertices, {"state": state, "physics_frames": frames})
+
+
+def hand_over(vertices: np.ndarray, info: dict[str, str | float | int]) -> DeformedObject:
+    """Add simulated vertices (2401, 3) m to the scene as a smooth cloth lying on the floor."""
+    mesh = _add_rendered(vertices)
+    points = read_vertices(mesh.data)[: SIDE * SIDE].reshape(SIDE, SIDE, 3)[::2, ::2].reshape(-1, 3)
+    return DeformedObject(mesh, points, VISIBILITY_RADIUS, info)
+
+
+def deform(rng: np.random.Generator, state: str) -> tuple[np.ndarray, int]:
+    """Simulate one state of ``STATES``: vertices (2401, 3) m, and the number of physics frames it took."""
+    if state not in STATES:
+        raise ValueError(f"state must be one of {', '.join(STATES)}, got {state!r}")
+    frames = 0
+    while True:
+        vertices = _rippled(rng, 0.001 if state == "flat" else 0.008)
+        for plan in _PLANS[state]:
+            grasps, count = plan(rng, vertices)
+            vertices = _simulate(vertices, grasps, count)
+            frames += count
+        if _is_plausible(vertices):
+            return vertices, frames
+
+
+def _is_plausible(vertices: np.ndarray) -> bool:
+    """Whether the cloth came to lie, hardly stretched: else its layers were pressed through each other on the way."""
+    grid = vertices.reshape(SIDE, SIDE, 3)
+    edges = np.concatenate([np.linalg.norm(np.diff(grid, axis=axis), axis=-1).ravel() for axis in (0, 1)])
+    return bool(np.quantile(edges, 0.99) < MAX_STRETCH * SPACING and np.ptp(vertices[:, 2]) < MAX_HEIGHT)
+
+
+def flat_vertices() -> np.ndarray:
+    """The rest shape (2401, 3) m, row-major, centred: row r runs along -y, column c along x."""
+    axis = np.linspace(-EXTENT / 2, EXTENT / 2, SIDE)
+    y, x = np.meshgrid(-axis, axis, indexing="ij")
+    return np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
+
+
+def _rippled(rng: np.random.Generator, height: float) -> np.ndarray:
+    """The rest shape with long random waves of about ``height`` m: gives physics something to buckle along."""
+    vertices = flat_vertices()
+    for _ in range(6):
+        wave = rng.normal(size=2) * 9.0  # rad/m
+        vertices[:, 2] += height * rng.normal() * np.sin(vertices[:, :2] @ wave + rng.uniform(0, 2 * np.pi))
+    vertices[:, 2] += 0.012 - vertices[:, 2].min()
+    return vertices
+
+
+# Plans: (rng, vertices) -> (grasps, frames) of one simulation. ------------------------------------------------------
+
+
+def _settle(rng: np.random.Generator, vertices: np.ndarray) -> tuple[list[Grasp], int]:
+    """Let go."""
+    return [], SETTLE_FRAMES
+
+
+def _drop(rng: np.random.Generator, vertices: np.ndarray) -> tuple[list[Grasp], int]:
+    """Raise and tilt the cloth in place, pin it at up to two random points in the air, let the rest fall."""
+    tilt = rng.uniform(-0.25, 0.25, size=2)
+    vertices[:, 2] += vertices[:, :2] @ tilt
+    vertices[:, 2] += rng.uniform(0.02, 0.08) - vertices[:, 2].min()
+    picked = rng.choice(len(vertices), size=rng.integers(0, 3), replace=False)
+    frames = 16
+    return [Grasp(int(i), np.zeros((frames, 3))) for i in picked], frames
+
+
+def _drag(rng: np.random.Generator, vertices: np.ndarray) -> tuple[list[Grasp], int]:
+    """Push two to four random points across the floor, roughly inwards, so that wrinkles form between them."""
+    frames = 14
+    picked = rng.choice(len(vertices), size=rng.integers(2, 5), replace=False)
+    progress = np.linspace(0, 1, frames)[:, None]
+    inward = -vertices[picked, :2] * rng.uniform(0.15, 0.55, size=(len(picked), 1))
+    target = inward + rng.normal(scale=0.04, size=(len(picked), 2))
+    return [Grasp(int(i), progress * np.append(t, 0.01)) for i, t in zip(picked, target, strict=True)], frames
+
+
+def _gather(rng: np.random.Generator, vertices: np.ndarray) -> tuple[list[Grasp], int]:
+    """Lift random points and bring them together: a crumpled heap."""
+    frames = 26
+    picked = rng.choice(len(vertices), size=rng.integers(4, 8), replace=False)
+    centre = rng.uniform(-0.1, 0.1, size=2)
+    grasps = []
+    for i in picked:
+        offset = (centre - vertices[i, :2]) * rng.uniform(0.5, 0.9)
+        grasps.append(Grasp(int(i), _arc(np.append(offset, rng.uniform(0.0, 0.06)), rng.uniform(0.05, 0.3), frames)))
+    return grasps, frames
+
+
+def _fold(rng: np.random.Generator, vertices: np.ndarray) -> tuple[list[Grasp], int]:
+    """Fold along a line parallel to an edge or oblique, grasping the far rim where it is furthest."""
+    angle = rng.integers(4) * np.pi / 2 + rng.choice([0.0, np.pi / 4, rng.uniform(0, np.pi / 2)])
+    return _fold_over(rng, vertices, angle, rng.uniform(0.35, 0.7))
+
+
+def _fold_corner(rng: np.random.Generator, vertices: np.ndarray) -> tuple[list[Grasp], int]:
+    """Fold one corner over, so that some of the under-side shows."""
+    angle = rng.integers(4) * np.pi / 2 + np.pi / 4 + rng.uniform(-0.35, 0.35)
+    return _fold_over(rng, vertices, angle, rng.uniform(0.2, 0.4))
+
+
+def _fold_over(rng: np.random.Generator, vertices: np.ndarray, angle: float, share: float) -> tuple[list[Grasp], int]:
+    """Move the vertices furthest in direction ``angle`` (rad) over the line that cuts off ``share`` of the cloth."""
+    normal = np.array([np.cos(angle), np.sin(angle)])
+    along = vertices[:, :2] @ normal
+    line = along.max() - share * np.ptp(along)
+    tangent = vertices[:, :2] @ np.array([-normal[1], normal[0]])
+    rim = np.flatnonzero(along > along.max() - 1.5 * SPACING)
+    held = {int(rim[np.argmin(tangent[rim])]), int(rim[np.argmax(tangent[rim])]), int(rim[len(rim) // 2])}
+    frames = int(18 + 24 * (along.max() - line))
+    reach, skew = rng.uniform(0.85, 1.0), rng.normal(scale=0.05)
+    grasps = []
+    for i in sorted(held):
+        shift = -2 * reach * (along[i] - line) * (normal + skew * np.array([-normal[1], normal[0]]))
+        grasps.append(Grasp(i, _arc(np.append(shift, 0.03), 0.75 * (along[i] - line), frames)))
+    anchors = np.flatnonzero(along < line - 4 * SPACING)
+    for i in rng.choice(anchors, size=min(4, len(anchors)), replace=False):
+        grasps.append(Grasp(int(i), np.zeros((frames, 3))))
+    return grasps, frames
+
+
+def _arc(shift: np.ndarray, height: float, frames: int) -> np.ndarray:
+    """Displacements (F, 3) along a half ellipse to ``shift`` (3,), ``height`` m high, slow at both ends, then held."""
+    hold = 3
+    s = np.linspace(0, 1, frames - hold)
+    theta = np.pi * (s + s * s * (3 - 2 * s)) / 2
+    path = (1 - np.cos(theta))[:, None] / 2 * shift
+    path[:, 2] += height * np.sin(theta)
+    return np.concatenate([path, np.repeat(path[-1:], hold, axis=0)])
+
+
+_PLANS = {
+    "flat": (_settle,),
+    "wrinkled": (_drop, _drag, _settle),
+    "folded": (_fold, _settle),
+    "folded twice": (_fold, _fold, _settle),
+    "corner": (_fold_corner, _settle),
+    "crumpled": (_gather, _settle),
+}
+
+
+# Physics. -----------------------------------------------------------------------------------------------------------
+
+
+def _simulate(vertices: np.ndarray, grasps: list[Grasp], frames: int) -> np.ndarray:
+    """Run ``frames`` frames of cloth physics from ``vertices`` at rest; the cloth remembers its flat shape."""
+    scene = bpy.context.scene
+    scene.frame_start, scene.frame_end = 1, frames
+    scene.frame_set(1)
+    cloth = add_mesh("cloth physics", flat_vertices(), grid_faces(SIDE))
+    floor = _add_floor()
+    _set_start(cloth, vertices)
+    hooks = [_add_hook(cloth, grasp) for grasp in grasps]
+    _add_physics(cloth, [grasp.vertex for grasp in grasps], frames)
+    for frame in range(1, frames + 1):
+        scene.frame_set(frame)
+    result = read_vertices(cloth.evaluated_get(bpy.context.evaluated_depsgraph_get()).data)
+    for thing in (cloth, floor, *hooks):
+        bpy.data.objects.remove(thing)
+    return result
+
+
+def _set_start(cloth: bpy.types.Object, vertices: np.ndarray) -> None:
+    cloth.shape_key_add(name="rest")
+    start = cloth.shape_key_add(name="start")
+    start.data.foreach_set("co", vertices.astype(np.float32).ravel())
+    start.value = 1.0
+
+
+def _add_hook(cloth: bpy.types.Object, grasp: Grasp) -> bpy.types.Object:
+    hook = bpy.data.objects.new("hook", None)
+    bpy.context.collection.objects.link(hook)
+    for frame, shift in enumerate(grasp.path, start=1):
+        hook.location = shift
+        hook.keyframe_insert("location", frame=frame)
+    modifier = cloth.modifiers.new("hook", "HOOK")
+    modifier.object = hook
+    modifier.falloff_type = "NONE"
+    modifier.vertex_indices_set([grasp.vertex])
+    return hook
+
+
+def _add_physics(cloth: bpy.types.Object, pinned: list[int], frames: int) -> None:
+    group = cloth.vertex_groups.new(name="pinned")
+    group.add(pinned, 1.0, "REPLACE")
+    modifier = cloth.modifiers.new("cloth", "CLOTH")
+    modifier.point_cache.frame_start, modifier.point_cache.frame_end = 1, frames
+    settings, collision = modifier.settings, modifier.collision_settings
+    settings.rest_shape_key = cloth.data.shape_keys.key_blocks["rest"]
+    settings.vertex_group_mass = "pinned"
+    settings.quality = 4
+    settings.bending_stiffness = 0.2
+    collision.use_self_collision = True
+    collision.self_distance_min = 0.006  # under a third of an edge: neighbours must not push each other
+    collision.distance_min = 0.005
+    collision.collision_quality = 1
+
+
+def _add_floor() -> bpy.types.Object:
+    corners = np.array([[-3, -3, 0], [3, -3, 0], [3, 3, 0], [-3, 3, 0]], dtype=float)
+    floor = add_mesh("physics floor", corners, np.array([[0, 1, 2, 3]]))
+    floor.modifiers.new("collision", "COLLISION")
+    floor.collision.cloth_friction = 40.0
+    floor.collision.thickness_outer = 0.005
+    return floor
+
+
+# The rendered surface. ----------------------------------------------------------------------------------------------
+
+
+def grid_faces(side: int) -> np.ndarray:
+    """Quads ((side - 1)², 4) of a row-major grid, their normals up where the grid is flat as in `flat_vertices`."""
+    index = np.arange(side * side).reshape(side, side)
+    quads = [index[1:, :-1], index[1:, 1:], index[:-1, 1:], index[:-1, :-1]]
+    return np.stack(quads, axis=-1).reshape(-1, 4)
+
+
+def _add_rendered(vertices: np.ndarray) -> bpy.types.Object:
+    """A smooth static mesh lying on z = 0; its first 2401 vertices are the simulated ones, smoothed."""
+    coarse = add_mesh("cloth coarse", vertices, grid_faces(SIDE))
+    rest = coarse.data.attributes.new("rest", "FLOAT_VECTOR", "POINT")  # textures in the cloth's own coordinates
+    rest.data.foreach_set("vector", (flat_vertices() / EXTENT).astype(np.float32).ravel())
+    subdivision = coarse.modifiers.new("subdivision", "SUBSURF")
+    subdivision.levels = 1
+    mesh = bpy.data.meshes.new_from_object(coarse.evaluated_get(bpy.context.evaluated_depsgraph_get()))
+    bpy.data.objects.remove(coarse)
+    dense = read_vertices(mesh)
+    dense[:, 2] += 0.001 - dense[:, 2].min()
+    mesh.vertices.foreach_set("co", dense.astype(np.float32).ravel())
+    mesh.shade_smooth()
+    mesh.materials.append(None)
+    cloth = bpy.data.objects.new("cloth", mesh)
+    bpy.context.collection.objects.link(cloth)
+    return cloth

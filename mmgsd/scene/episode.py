@@ -1,0 +1,68 @@
+"""One episode: an object is deformed once and seen in several views, each with its own camera, light and materials."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+
+from mmgsd.config import OBJECTS, RenderConfig
+from mmgsd.scene import randomize, render
+from mmgsd.scene.render import DeformedObject, View
+
+SPLITS = ("train", "test")
+
+
+def render_episode(config: RenderConfig, split: str, episode: int, n_views: int) -> list[View]:
+    """Create, populate, render and label ``n_views`` views of one deformation.
+
+    The same arguments give the same pixels in any process. ValueError for an unknown split.
+    """
+    if split not in SPLITS:
+        raise ValueError(f"split must be one of {', '.join(SPLITS)}, got {split!r}")
+    rng = np.random.default_rng([config.seed, OBJECTS.index(config.object), SPLITS.index(split), episode])
+    scene = render.reset_scene()
+    deformed = build_object(rng, config)
+    floor = add_floor()
+    render.setup_cycles(scene, config.size, config.samples)
+    bvh = render.build_bvh(deformed.mesh)
+    return [_render_view(rng, config, scene, deformed, floor, bvh) for _ in range(n_views)]
+
+
+def build_object(rng: np.random.Generator, config: RenderConfig) -> DeformedObject:
+    """Add a randomly deformed object of the configured kind to the current scene."""
+    if config.object == "cloth":
+        from mmgsd.scene.cloth import build_cloth as build
+    else:
+        from mmgsd.scene.rope import build_rope as build
+    return build(rng, config)
+
+
+def add_floor() -> bpy.types.Object:
+    """Add the plane z = 0, 12 m wide, to the current scene."""
+    corners = np.array([[-6, -6, 0], [6, -6, 0], [6, 6, 0], [-6, 6, 0]], dtype=float)
+    return render.add_mesh("floor", corners, np.array([[0, 1, 2, 3]]))
+
+
+def _render_view(
+    rng: np.random.Generator,
+    config: RenderConfig,
+    scene: bpy.types.Scene,
+    deformed: DeformedObject,
+    floor: bpy.types.Object,
+    bvh: render.BVHTree,
+) -> View:
+    camera, turn = randomize.draw_camera(rng, deformed.points, config.size, config.rotation_deg)
+    render.place_camera(scene, camera)
+    randomize.draw_light(rng, scene)
+    colour, background = randomize.draw_background(rng, floor)
+    texture = randomize.draw_object_material(rng, deformed.mesh, colour)
+    image, mask = render.render_image(scene, seed=int(rng.integers(2**31)))
+    return View(
+        image=image,
+        mask=mask,
+        xy=camera.project(deformed.points).astype(np.float32),
+        visible=render.find_visible(deformed, bvh, camera),
+        intrinsics=camera.intrinsics,
+        camera_pose=camera.pose,
+        info={**deformed.info, "turn_deg": turn, "texture": texture, "background": background},
+    )

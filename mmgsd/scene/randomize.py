@@ -1,0 +1,144 @@
+"""Domain randomisation: camera, light, background and materials of one view, drawn from an explicit ``rng``."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+from mathutils import Euler, Vector
+
+from mmgsd.scene.render import Camera
+from mmgsd.scene.textures import (
+    BACKGROUNDS,
+    CLOTH_TEXTURES,
+    OBJECT_TEXTURES,
+    Colour,
+    Shader,
+    draw_colour,
+    draw_contrasting,
+)
+
+MIN_SPAN = 0.8  # m seen across the image at least: a small heap stays small
+MAX_OUTSIDE = 0.05  # share of the material points that may fall out of the image
+
+
+# Camera. ------------------------------------------------------------------------------------------------------------
+
+
+def draw_camera(
+    rng: np.random.Generator, points: np.ndarray, size: tuple[int, int], rotation_deg: float
+) -> tuple[Camera, float]:
+    """A camera above points (N, 3) m, and the angle (degrees in ±rotation_deg) by which it turns the image."""
+    turn = rng.uniform(-rotation_deg, rotation_deg)
+    while True:
+        camera = _draw_pose(rng, points, size, np.radians(turn))
+        outside = 1 - camera.contains(camera.project(points)).mean()
+        if outside <= MAX_OUTSIDE:
+            return camera, float(turn)
+
+
+def _draw_pose(rng: np.random.Generator, points: np.ndarray, size: tuple[int, int], turn: float) -> Camera:
+    """A few degrees of tilt; distance, zoom and shift such that the object's bounding box is about in the image."""
+    tilt = rng.normal(scale=np.radians(4.0), size=2).clip(-0.2, 0.2)
+    down = np.array(Euler((np.pi + tilt[0], tilt[1], 0.0)).to_matrix())
+    rotation = np.array(Euler((0.0, 0.0, turn)).to_matrix()) @ down
+    distance = rng.uniform(1.6, 3.0)
+    plane = points @ rotation[:, :2]  # (N, 2) m along the image's axes
+    low, high = plane.min(axis=0), plane.max(axis=0)
+    width = np.array(size) * max(np.max((high - low) / size), MIN_SPAN / max(size)) * rng.uniform(1.06, 1.5)
+    slack = (width - (high - low)) / 2
+    aim = (low + high) / 2 + rng.uniform(-0.85, 0.85, size=2) * slack
+    height = points[:, 2].mean()
+    centre = rotation[:, :2] @ aim
+    centre = centre + rotation[:, 2] * (height - centre[2]) / rotation[2, 2]
+    focal = size[0] * distance / width[0]
+    intrinsics = np.array([[focal, 0, (size[0] - 1) / 2], [0, focal, (size[1] - 1) / 2], [0, 0, 1]])
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, centre - distance * rotation[:, 2]
+    return Camera(intrinsics, pose, size)
+
+
+# Light. -------------------------------------------------------------------------------------------------------------
+
+
+def draw_light(rng: np.random.Generator, scene: bpy.types.Scene) -> None:
+    """Ambient light and one lamp, a sun or an area, exposed about right for a white sheet on the floor."""
+    exposure, ambient = np.exp(rng.normal(scale=0.22)), rng.uniform(0.25, 0.75)
+    tint = rng.normal(scale=0.06)  # warm to cold
+    colour = np.clip([1 + tint, 1.0, 1 - tint], 0, 2)
+    _set_world(scene, (*np.clip([1 - tint, 1, 1 + tint], 0, 2), 1.0), exposure * ambient)
+    elevation, azimuth = rng.uniform(np.radians(30), np.radians(85)), rng.uniform(0, 2 * np.pi)
+    towards = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
+    radiance = exposure * (1 - ambient) / np.sin(elevation)  # of a white sheet
+    lamp, distance = _new_lamp(rng, scene)
+    lamp.data.color = colour
+    lamp.data.energy = radiance * np.pi * (np.pi * distance**2 if lamp.data.type == "AREA" else 1.0)
+    lamp.location = distance * towards
+    lamp.rotation_euler = Vector(towards).to_track_quat("Z", "Y").to_euler()
+
+
+def _set_world(scene: bpy.types.Scene, colour: Colour, strength: float) -> None:
+    if scene.world is None:
+        scene.world = bpy.data.worlds.new("world")
+        scene.world.use_nodes = True
+    background = scene.world.node_tree.nodes["Background"]
+    background.inputs["Color"].default_value, background.inputs["Strength"].default_value = colour, strength
+
+
+def _new_lamp(rng: np.random.Generator, scene: bpy.types.Scene) -> tuple[bpy.types.Object, float]:
+    """The scene's only lamp, replaced, and its distance from the origin in m."""
+    if "lamp" in bpy.data.objects:
+        bpy.data.lights.remove(bpy.data.objects["lamp"].data)  # takes the object with it
+    if rng.random() < 0.5:
+        data = bpy.data.lights.new("lamp", "SUN")
+        data.angle = np.radians(np.exp(rng.uniform(np.log(0.5), np.log(40.0))))
+    else:
+        data = bpy.data.lights.new("lamp", "AREA")
+        data.size = rng.uniform(0.2, 2.0)
+    lamp = bpy.data.objects.new("lamp", data)
+    scene.collection.objects.link(lamp)
+    return lamp, float(rng.uniform(1.8, 4.0))
+
+
+# Materials. -----------------------------------------------------------------------------------------------------------
+
+
+def _draw_gloss(rng: np.random.Generator, chance: float) -> float:
+    """No shine, or with ``chance`` a little."""
+    return rng.uniform(0.02, 0.12) if rng.random() < chance else 0.0
+
+
+def draw_object_material(rng: np.random.Generator, mesh: bpy.types.Object, background: Colour) -> str:
+    """Fill every material slot of the object anew; the name of the main slot's texture."""
+    main = draw_contrasting(rng, background)
+    names = []
+    for i, slot in enumerate(mesh.material_slots):
+        colour = main if i == 0 else draw_contrasting(rng, main, distance=0.35, exempt=0.0)
+        slot.material = slot.material or bpy.data.materials.new(f"object {i}")
+        shader = Shader(slot.material)
+        textures = CLOTH_TEXTURES if "rest" in mesh.data.attributes else OBJECT_TEXTURES
+        names.append(str(rng.choice(list(textures))))
+        surface = _two_faced(rng, shader, textures[names[-1]](rng, shader, colour))
+        shader.finish(surface, rng.uniform(0.3, 1.0), _draw_gloss(rng, 0.25), True)
+    return names[0]
+
+
+def _two_faced(rng: np.random.Generator, shader: Shader, front: object) -> object:
+    """Sometimes the under-side has another colour."""
+    back = draw_colour(rng)
+    if rng.random() < 0.7:
+        return front
+    return shader.mix(shader.node("NewGeometry").outputs["Backfacing"], front, back)
+
+
+def draw_background(rng: np.random.Generator, floor: bpy.types.Object) -> tuple[Colour, str]:
+    """Give the floor a new material: its main colour, and the name of its texture."""
+    colour = draw_colour(rng)
+    name = str(rng.choice(list(BACKGROUNDS)))
+    if not floor.material_slots:
+        floor.data.materials.append(bpy.data.materials.new("floor"))
+    shader = Shader(floor.material_slots[0].material)
+    place = shader.node("TexCoord").outputs["Object"]
+    mapping = {"Vector": place, "Location": rng.uniform(-9, 9, 3), "Rotation": (0, 0, rng.uniform(0, 2 * np.pi))}
+    place = shader.node("Mapping", mapping).outputs[0]
+    shader.finish(BACKGROUNDS[name](rng, shader, colour, place), rng.uniform(0.25, 1.0), _draw_gloss(rng, 0.3), False)
+    return colour, name

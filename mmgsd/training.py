@@ -1,0 +1,299 @@
+"""The one training loop for all methods."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import os
+import shutil
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pandas as pd
+import torch
+from safetensors.torch import save_file
+from torch import Tensor
+from torch.nn import functional as F
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+from tqdm.auto import tqdm
+
+from mmgsd import losses
+from mmgsd.augmentation import jitter_colours, sample_affine, warp_image, warp_points
+from mmgsd.config import TrainConfig
+from mmgsd.dataset import Dataset, load_dataset
+from mmgsd.evaluation import calibrate_bandwidth
+from mmgsd.losses import CONTRASTIVE, MATCHES_OF_ONE
+from mmgsd.matching import Matcher
+from mmgsd.network import (
+    build_network,
+    compute_cell_centres,
+    compute_input_size,
+    find_device,
+    sample_descriptors,
+)
+
+WEIGHTS, CHECKPOINT, LOG = "weights.safetensors", "checkpoint.pt", "log.csv"
+CHECKPOINT_SECONDS = 60.0  # of training between two checkpoints
+CACHE_SCALE = 1.25  # images are kept in memory at this multiple of the network's input size
+
+
+@dataclass(frozen=True)
+class TrainingImages:
+    """A data set's images in memory at about the network's resolution, labels in full-image px."""
+
+    images: list[np.ndarray]  # N of (h, w, 3) uint8
+    masks: list[np.ndarray]  # N of (h, w) uint8, 255 on the object
+    xy: np.ndarray  # (N, P, 2) px
+    visible: np.ndarray  # (N, P) bool
+    size: tuple[int, int]  # full (W, H) px
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Augmented images as tensors."""
+
+    image: Tensor  # (B, 3, h, w) in [0, 1]
+    mask: Tensor  # (B, h, w) bool
+    xy: Tensor  # (B, P, 2) full-image px
+    askable: Tensor  # (B, P) bool, points visible and inside
+    inside: Tensor  # (B, P) bool
+
+
+def compute_sigma(config: TrainConfig, step: int) -> float:
+    """Std of the target at a step in px: geometric from ``sigma_start_px`` to ``sigma_px`` over two thirds."""
+    progress = min(1.0, step / max(1.0, config.steps * 2 / 3))
+    start = max(config.sigma_start_px, config.sigma_px)
+    return start * (config.sigma_px / start) ** progress
+
+
+def compute_learning_rate(config: TrainConfig, step: int) -> float:
+    """Warm-up and cosine decay, or the reference's 0.9 every 250 steps."""
+    if config.schedule == "step":
+        return config.learning_rate * 0.9 ** (step // 250)
+    warm_up = max(1, config.steps // 20)
+    progress = (step - warm_up) / max(1, config.steps - warm_up)
+    return config.learning_rate * (min(1.0, (step + 1) / warm_up) * (0.01 + 0.99 * _cosine(max(0.0, progress))))
+
+
+def train_model(
+    config: TrainConfig, dataset: Path, folder: Path, *,
+    overwrite: bool = False, device: str = "", progress: bool = True,
+) -> Path:  # fmt: skip
+    """Train one model on the data set's training split; returns the path of its weights (safetensors).
+
+    A finished model is returned as it is, a killed run goes on from its last checkpoint and ends with the same weights.
+    Raises ValueError where the data set is of another object or does not store the symmetry group.
+    """
+    weights = folder / WEIGHTS
+    if weights.is_file() and not overwrite:
+        return weights
+    if overwrite and folder.exists():
+        shutil.rmtree(folder)
+    data = load_dataset(dataset, "train")
+    if data.object != config.object:
+        raise ValueError(f"object is {config.object!r}, but {dataset} shows a {data.object}")
+    run = _Run(config, data, folder, torch.device(device or find_device()))
+    run.resume()
+    bar = tqdm(range(run.step, config.steps), desc=config.name, disable=not progress, leave=False)
+    for _ in bar:
+        bar.set_postfix(loss=f"{run.advance():.3f}", refresh=False)
+    return run.finish(weights)
+
+
+def load_training_images(data: Dataset, input_px: int, *, indices: np.ndarray | None = None) -> TrainingImages:
+    """Read images and masks once, reduced to a little more than the network's input size."""
+    indices = np.arange(len(data)) if indices is None else indices
+    width, height = (round(s * CACHE_SCALE) for s in compute_input_size(data.size, input_px))
+
+    def load(index: int) -> tuple[np.ndarray, np.ndarray]:
+        image, mask = data.load_image(index), data.load_mask(index).astype(np.uint8) * 255
+        return tuple(cv2.resize(a, (width, height), interpolation=cv2.INTER_AREA) for a in (image, mask))
+
+    with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
+        images, masks = zip(*pool.map(load, indices), strict=True)
+    return TrainingImages(list(images), list(masks), data.xy[indices], data.visible[indices], data.size)
+
+
+def make_batch(
+    images: TrainingImages, indices: np.ndarray, config: TrainConfig, rng: np.random.Generator, device: torch.device
+) -> Batch:
+    """Augment the images ``indices`` (B,), labels with them, and move them to the device."""
+    size = compute_input_size(images.size, config.input_px)
+    identity = np.eye(2, 3)
+    pixels, masks, points = [], [], []
+    for index in indices:
+        affine = sample_affine(images.size, rng, rotate=config.rotate) if config.augment else identity
+        image = warp_image(images.images[index], affine, images.size, size)
+        pixels.append(jitter_colours(image, rng) if config.augment else image)
+        masks.append(warp_image(images.masks[index], affine, images.size, size) > 127)
+        points.append(warp_points(images.xy[index], affine))
+    xy = np.stack(points)
+    inside = np.all((xy > -0.5) & (xy < np.array(images.size) - 0.5), axis=-1)
+    image = torch.from_numpy(np.stack(pixels)).to(device).permute(0, 3, 1, 2).float() / 255
+    tensors = (torch.from_numpy(a).to(device) for a in (np.stack(masks), xy.astype(np.float32)))
+    askable = torch.from_numpy(inside & images.visible[indices]).to(device)
+    return Batch(image, *tensors, askable, torch.from_numpy(inside).to(device))
+
+
+def compute_loss(
+    config: TrainConfig, descriptors: Tensor, batch: Batch, permutations: Tensor, size: tuple[int, int], step: int
+) -> Tensor:
+    """The configured method's loss of a batch: every image is a source and a target of others.
+
+    ``descriptors`` (B, D, h, w), ``permutations`` (G, P) of the symmetry group. Randomness comes from seed and step.
+    """
+    generator = torch.Generator(descriptors.device).manual_seed(config.seed * 1_000_003 + step)
+    pair = _sample_batch_pairs(len(descriptors), config.pairs, generator, descriptors.device)  # (2, K)
+    points = torch.multinomial(batch.askable[pair[0]].float() + 1e-9, config.queries, True, generator=generator)
+    if config.method in MATCHES_OF_ONE:
+        permutations = permutations[:1]
+    orbit = permutations[:, points].permute(1, 2, 0)  # (K, Q, G)
+    sampled = sample_descriptors(descriptors, batch.xy, size)  # (B, P, D)
+    source = sampled[pair[0][:, None], points]  # (K, Q, D)
+    modes = batch.xy[pair[1][:, None, None], orbit]  # (K, Q, G, 2)
+    valid = batch.inside[pair[1][:, None, None], orbit] & batch.askable[pair[0][:, None], points][..., None]
+    xs, ys = (c.to(descriptors.device) for c in compute_cell_centres(size, descriptors.shape[-2:]))
+    if config.method in CONTRASTIVE:
+        valid = valid & batch.askable[pair[1][:, None, None], orbit]  # as in Dense Object Nets: seen in both images
+        match = (source[:, :, None] - sampled[pair[1][:, None, None], orbit]).square().sum(-1)
+        far, apart = _sample_non_matches(config, descriptors, batch, pair, source, modes, (xs, ys), generator)
+        function = losses.pcl if config.method == "pcl" else losses.spcl
+        return function((match + 1e-12).sqrt(), valid, (far + 1e-12).sqrt(), apart, margin=config.margin)
+    target = losses.compute_target(modes, valid, xs, ys, compute_sigma(config, step))
+    squared = losses.compute_squared_distances(source, descriptors[pair[1]].flatten(2).mT)
+    return losses.mmgsd(squared, target)
+
+
+class _Run:
+    """A training run that can be killed between any two steps."""
+
+    def __init__(self, config: TrainConfig, data: Dataset, folder: Path, device: torch.device) -> None:
+        self.config, self.data, self.folder = config, data, folder
+        self.device, self.size = device, data.size
+        group = data.group(config.group)
+        self.permutations = torch.tensor(group.permutations, device=device)
+        self.images = load_training_images(data, config.input_px)
+        torch.manual_seed(config.seed)
+        network = build_network(config.network, config.descriptor_dim).to(device)
+        self.network = network.to(memory_format=torch.channels_last)
+        # the average of the last steps' weights, statistics of batch normalisation included, is what is kept
+        average = get_ema_multi_avg_fn(1 - 1 / max(2.0, config.steps / 50))
+        self.average = AveragedModel(self.network, multi_avg_fn=average, use_buffers=True)
+        self.optimiser = torch.optim.AdamW(
+            self.network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
+        )
+        self.step, self.seconds, self.saved_at, self.log = 0, 0.0, 0.0, []
+
+    def advance(self) -> float:
+        """One optimiser step; saves a checkpoint every ``CHECKPOINT_SECONDS``."""
+        start = time.perf_counter()
+        rng = np.random.default_rng([self.config.seed, self.step])
+        count = len(self.images.images)
+        indices = rng.choice(count, self.config.batch, replace=count < self.config.batch)
+        batch = make_batch(self.images, indices, self.config, rng, self.device)
+        for group in self.optimiser.param_groups:
+            group["lr"] = compute_learning_rate(self.config, self.step)
+        self.network.train()
+        descriptors = self.network(batch.image.contiguous(memory_format=torch.channels_last))
+        loss = compute_loss(self.config, descriptors, batch, self.permutations, self.size, self.step)
+        self.optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), 5.0)
+        self.optimiser.step()
+        self.average.update_parameters(self.network)
+        self.step += 1
+        self.seconds += time.perf_counter() - start
+        self.log.append({"step": self.step, "loss": loss.item(), "seconds": round(self.seconds, 2)})
+        if self.seconds - self.saved_at >= CHECKPOINT_SECONDS:
+            self.save()
+        return loss.item()
+
+    def save(self) -> None:
+        """Write a checkpoint aside, then rename it."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        state = {
+            "config": json.dumps(dataclasses.asdict(self.config)),
+            "network": self.network.state_dict(),
+            "average": self.average.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+            "step": self.step,
+            "seconds": self.seconds,
+            "log": self.log,
+        }
+        aside = self.folder / (CHECKPOINT + ".tmp")
+        torch.save(state, aside)
+        os.replace(aside, self.folder / CHECKPOINT)
+        self.saved_at = self.seconds
+
+    def resume(self) -> None:
+        """Go on from the folder's checkpoint, if there is one; ValueError where it is of another configuration."""
+        path = self.folder / CHECKPOINT
+        if not path.is_file():
+            return
+        state = torch.load(path, map_location=self.device, weights_only=True)
+        if state["config"] != json.dumps(dataclasses.asdict(self.config)):
+            raise ValueError(f"{path} belongs to another configuration: choose another folder or overwrite=True")
+        for name in ("network", "average", "optimiser"):
+            getattr(self, name).load_state_dict(state[name])
+        self.step, self.seconds, self.log = state["step"], state["seconds"], state["log"]
+        self.saved_at = self.seconds
+
+    def finish(self, weights: Path) -> Path:
+        """Write log and weights, the weights last: a folder that has them is finished."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        pd.DataFrame(self.log).to_csv(self.folder / LOG, index=False)
+        modes = 1 if self.config.method in MATCHES_OF_ONE else len(self.permutations)
+        metadata = {
+            "format": "mmgsd-1",
+            "config": json.dumps(dataclasses.asdict(self.config)),
+            "size": json.dumps(self.size),
+            "modes": str(modes),
+            "seconds": f"{self.seconds:.1f}",
+            "device": self.device.type,
+        }
+        if self.config.method in CONTRASTIVE:
+            matcher = Matcher(self.average.module, self.config, modes=modes, size=self.size, device=self.device.type)
+            metadata["bandwidth"] = repr(calibrate_bandwidth(matcher, self.data))
+        state = {name: value.contiguous() for name, value in self.average.module.state_dict().items()}
+        aside = weights.with_suffix(".tmp")
+        save_file(state, aside, metadata)
+        os.replace(aside, weights)
+        (self.folder / CHECKPOINT).unlink(missing_ok=True)
+        return weights
+
+
+def _cosine(progress: float) -> float:
+    return 0.5 * (1 + math.cos(math.pi * min(1.0, progress)))
+
+
+def _sample_batch_pairs(images: int, pairs: int, generator: torch.Generator, device: torch.device) -> Tensor:
+    """(2, K) different images, all ordered pairs where no more are asked for."""
+    ordered = (~torch.eye(images, dtype=torch.bool, device=device)).nonzero()  # (B (B - 1), 2)
+    picked = torch.randperm(len(ordered), generator=generator, device=device)[:pairs]
+    return ordered[picked].T
+
+
+def _sample_non_matches(
+    config: TrainConfig, descriptors: Tensor, batch: Batch, pair: Tensor, source: Tensor, modes: Tensor,
+    cells: tuple[Tensor, Tensor], generator: torch.Generator,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Squared distances (K, Q, N) to random cells, half on the object and half off it, and which are no match."""
+    (k, q, _), (height, width) = source.shape, descriptors.shape[-2:]
+    on_object = F.adaptive_avg_pool2d(batch.mask.float()[:, None], (height, width))[pair[1], 0].flatten(1)  # (K, C)
+    half = config.non_matches // 2
+    drawn = [
+        torch.multinomial(weight + 1e-6, q * count, True, generator=generator).view(k, q, count)
+        for weight, count in ((on_object, half), (1 - on_object, config.non_matches - half))
+    ]
+    cell = torch.cat(drawn, -1)  # (K, Q, N)
+    flat = descriptors[pair[1]].flatten(2).mT  # (K, C, D)
+    picked = flat[torch.arange(k, device=cell.device)[:, None, None], cell]  # (K, Q, N, D)
+    xs, ys = cells
+    position = torch.stack([xs[cell % width], ys[cell // width]], -1)  # (K, Q, N, 2)
+    gap = (position[:, :, :, None] - modes[:, :, None]).square().sum(-1).amin(-1)  # (K, Q, N)
+    return (picked - source[:, :, None]).square().sum(-1), gap > (1.5 * float(xs[1] - xs[0])) ** 2

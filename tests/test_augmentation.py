@@ -1,0 +1,109 @@
+"""Augmentation: labels move as the pixels do, at every resolution."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from mmgsd.augmentation import compute_scaling, jitter_colours, sample_affine, warp_image, warp_points
+
+RESOLUTIONS = [  # full image, the copy in memory, the network's input
+    ((485, 485), (485, 485), (485, 485)),
+    ((485, 485), (160, 160), (128, 128)),
+    ((640, 480), (200, 150), (160, 120)),
+    ((640, 480), (80, 60), (64, 48)),
+]
+
+
+def draw_dot(xy: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """A bright spot of 8 px at ``xy`` on black, (H, W) uint8."""
+    columns, rows = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
+    return (255 * np.exp(-((columns - xy[0]) ** 2 + (rows - xy[1]) ** 2) / (2 * 8**2))).astype(np.uint8)
+
+
+def find_dot(image: np.ndarray, full: tuple[int, int], near: np.ndarray) -> np.ndarray:
+    """Centre of brightness in full-image px within 60 px of ``near``: the border mirrors the spot farther away."""
+    rows, columns = np.indices(image.shape)
+    small = np.stack([columns, rows, np.ones_like(rows)], axis=-1)  # (h, w, 3)
+    xy = (small @ compute_scaling((image.shape[1], image.shape[0]), full).T)[..., :2]
+    weight = image * (np.linalg.norm(xy - near, axis=-1) < 60)
+    return (xy * weight[..., None]).sum((0, 1)) / weight.sum()
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("coloured", [False, True])
+@pytest.mark.parametrize(("full", "memory", "size"), RESOLUTIONS)
+def test_labels_move_as_pixels_do(
+    full: tuple[int, int], memory: tuple[int, int], size: tuple[int, int], coloured: bool, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    affine = sample_affine(full, rng)
+    xy = np.array(full) / 2 + rng.uniform(-60, 60, 2)
+    image = cv2.resize(draw_dot(xy, full), memory, interpolation=cv2.INTER_AREA)
+    image = np.repeat(image[..., None], 3, axis=-1) if coloured else image
+    warped = warp_image(image, affine, full, size)
+    assert warped.shape[:2] == (size[1], size[0])
+    expected = warp_points(xy, affine)
+    found = find_dot(warped[..., 0] if coloured else warped, full, expected)
+    np.testing.assert_allclose(found, expected, atol=0.75)
+
+
+def test_identity_changes_nothing(rng: np.random.Generator) -> None:
+    image = rng.integers(0, 256, (60, 80, 3), dtype=np.uint8)
+    np.testing.assert_array_equal(warp_image(image, np.eye(2, 3), (80, 60), (80, 60)), image)
+    points = rng.uniform(0, 60, (2, 7, 2))
+    np.testing.assert_array_equal(warp_points(points, np.eye(2, 3)), points)
+
+
+def test_points_by_hand() -> None:
+    affine = np.array([[0.0, -2.0, 5.0], [2.0, 0.0, 1.0]])  # turned by 90°, doubled, moved by (5, 1)
+    np.testing.assert_array_equal(warp_points(np.array([[1.0, 3.0]]), affine), [[-1.0, 3.0]])
+
+
+def test_no_object_enters_a_mask_from_outside() -> None:
+    moved = warp_image(np.full((50, 50), 255, np.uint8), np.array([[1.0, 0, 20], [0, 1, 0]]), (50, 50), (50, 50))
+    assert (moved[:, :20] == 0).all()
+    assert (moved[:, 20:] == 255).all()
+
+
+def test_affine_without_rotation_only_scales_and_moves(rng: np.random.Generator) -> None:
+    affine = sample_affine((640, 480), rng, rotate=False)
+    assert affine[0, 1] == affine[1, 0] == 0
+    assert affine[0, 0] == affine[1, 1] > 0
+
+
+def test_affine_stays_within_its_ranges(rng: np.random.Generator) -> None:
+    full, centre = np.array([640, 480]), np.array([319.5, 239.5])
+    for affine in (sample_affine((640, 480), rng) for _ in range(100)):
+        assert np.exp(-0.2) <= np.sqrt(np.linalg.det(affine[:, :2])) <= np.exp(0.2)
+        assert (np.abs(warp_points(centre, affine) - centre) <= 0.06 * full + 1e-9).all()
+
+
+def test_scaling_keeps_pixel_edges() -> None:
+    corner = compute_scaling((640, 480), (64, 48)) @ [-0.5, 479.5, 1]
+    np.testing.assert_allclose(corner, [-0.5, 47.5, 1])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_jitter_keeps_shape_and_type(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    image = rng.integers(0, 256, (40, 60, 3), dtype=np.uint8)
+    jittered = jitter_colours(image, rng)
+    assert (jittered.shape, jittered.dtype) == (image.shape, np.uint8)
+    assert (jittered != image).any()
+
+
+def test_jitter_leaves_its_argument_alone(rng: np.random.Generator) -> None:
+    image = np.full((8, 8, 3), 100, dtype=np.uint8)
+    jitter_colours(image, rng)
+    assert (image == 100).all()
+
+
+def test_randomness_is_the_generators() -> None:
+    image = np.full((20, 20, 3), 90, dtype=np.uint8)
+    one, two = (
+        (sample_affine((20, 20), r), jitter_colours(image, r)) for r in (np.random.default_rng(5) for _ in range(2))
+    )
+    np.testing.assert_array_equal(one[0], two[0])
+    np.testing.assert_array_equal(one[1], two[1])

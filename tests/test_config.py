@@ -1,0 +1,143 @@
+"""Configurations: presets load, whatever is wrong stops at once, digests tell configurations apart."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from mmgsd import config as config_module
+from mmgsd.config import (
+    METHODS,
+    OBJECTS,
+    EvaluateConfig,
+    Paths,
+    RenderConfig,
+    TrainConfig,
+    digest,
+    find_root,
+    from_dict,
+    load_preset,
+)
+
+OTHER = {  # another accepted value for the fields that are no plain numbers or flags
+    "object": "cloth", "method": "pcl", "group": "identity", "network": "resnet34", "schedule": "step",
+    "rotation_deg": 45.0,
+}  # fmt: skip
+CONFIGS = (RenderConfig(object="rope"), TrainConfig(object="rope"), EvaluateConfig(points=600))
+FIELDS = [(config, field.name) for config in CONFIGS for field in dataclasses.fields(config)]
+
+
+@pytest.mark.parametrize("name", ["smoke", "quick", "paper"])
+def test_preset_configures_both_objects(name: str) -> None:
+    preset = load_preset(name)
+    assert preset.name == name
+    for part in (preset.render, preset.train, preset.ablation):
+        assert {key: value.object for key, value in part.items()} == {o: o for o in OBJECTS}
+
+
+def test_paper_preset_has_the_papers_sizes() -> None:
+    preset = load_preset("paper")
+    assert {(r.train_images, r.test_images, r.size) for r in preset.render.values()} == {
+        (3500, 500, (485, 485)),
+        (3500, 500, (640, 480)),
+    }
+    assert (preset.evaluate.pairs, preset.evaluate.points) == (500, 625)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_methods_of_a_preset_differ_in_nothing_else(method: str) -> None:
+    preset = load_preset("quick")
+    assert dataclasses.replace(preset.method("cloth", method), method="mmgsd") == preset.train["cloth"]
+
+
+def test_unknown_preset_names_the_accepted_ones() -> None:
+    with pytest.raises(ValueError, match="preset must be one of 'smoke', 'quick', 'paper'.*'paper'.*got 'papr'"):
+        load_preset("papr")
+
+
+@pytest.mark.parametrize(
+    ("kind", "values", "message"),
+    [
+        (TrainConfig, {"sigma_px": -1.0}, "sigma_px must be greater than 0, got -1.0"),
+        (TrainConfig, {"sigma_px": 0}, "sigma_px must be greater than 0"),
+        (TrainConfig, {"sigma_px": float("nan")}, "sigma_px must be a finite float, got nan"),
+        (TrainConfig, {"margin": float("inf")}, "margin must be a finite float, got inf"),
+        (TrainConfig, {"weight_decay": -0.1}, "weight_decay must be at least 0"),
+        (TrainConfig, {"steps": "200"}, "steps must be int, got '200'"),
+        (TrainConfig, {"steps": 2.5}, "steps must be int, got 2.5"),
+        (TrainConfig, {"steps": True}, "steps must be int, got True"),
+        (TrainConfig, {"steps": 0}, "steps must be at least 1, got 0"),
+        (TrainConfig, {"augment": 1}, "augment must be bool, got 1"),
+        (TrainConfig, {"batch": 1}, "batch must be at least 2"),
+        (TrainConfig, {"non_matches": 1}, "non_matches must be at least 2"),
+        (TrainConfig, {"input_px": 32}, "input_px must be at least 64"),
+        (TrainConfig, {"seed": -1}, "seed must be at least 0, got -1"),
+        (TrainConfig, {"method": "mmgds"}, "method must be one of 'pcl', .*did you mean 'mmgsd'.*got 'mmgds'"),
+        (TrainConfig, {"network": "vgg"}, "network must be one of 'lite0', 'resnet34', got 'vgg'"),
+        (TrainConfig, {"schedule": "none"}, "schedule must be one of 'cosine', 'step'"),
+        (RenderConfig, {"object": "towel"}, "object must be one of 'cloth', 'rope', got 'towel'"),
+        (RenderConfig, {"train_images": 0}, "train_images must be at least 1"),
+        (RenderConfig, {"rotation_deg": 181.0}, r"rotation_deg must be in \(0, 180\], got 181"),
+        (RenderConfig, {"ball": True}, "ball must be False for a cloth, got True"),
+        (RenderConfig, {"seed": -1}, "seed must be at least 0, got -1"),
+        (EvaluateConfig, {"points": 626}, "points must be between 1 and 625, got 626"),
+        (EvaluateConfig, {"pairs": 0}, "pairs must be at least 1"),
+        (EvaluateConfig, {"seed": -1}, "seed must be at least 0, got -1"),
+    ],
+)
+def test_wrong_value_names_argument_and_what_is_accepted(kind: type, values: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        kind(**values)
+
+
+def test_unknown_key_names_the_nearest_one() -> None:
+    with pytest.raises(ValueError, match="a key of TrainConfig must be one of .*did you mean 'sigma_px'.*got 'sigma'"):
+        from_dict(TrainConfig, {"sigma": 1.0})
+
+
+def test_stored_values_give_the_same_configuration() -> None:
+    config = TrainConfig(object="rope", method="spcl", steps=7)
+    assert from_dict(TrainConfig, dataclasses.asdict(config)) == config
+
+
+@pytest.mark.parametrize(("config", "name"), FIELDS, ids=[f"{type(c).__name__}.{n}" for c, n in FIELDS])
+def test_digest_changes_with_every_field(config: RenderConfig | TrainConfig | EvaluateConfig, name: str) -> None:
+    value = getattr(config, name)
+    other = OTHER[name] if name in OTHER else (not value if isinstance(value, bool) else value + 1)
+    assert digest(dataclasses.replace(config, **{name: other})) != digest(config)
+
+
+def test_integer_and_float_are_one_configuration() -> None:
+    assert digest(TrainConfig(sigma_px=1)) == digest(TrainConfig(sigma_px=1.0))
+
+
+def test_the_objects_own_group_is_filled_in() -> None:
+    assert TrainConfig(object="rope").group == "c2"
+    assert digest(TrainConfig()) == digest(TrainConfig(group="c4"))
+
+
+def test_model_folders_differ_between_configurations() -> None:
+    paths = Paths(Path("root"), "smoke")
+    configs = [TrainConfig(method=m, sigma_px=s) for m in METHODS for s in (1.0, 4.0)]
+    assert len({paths.model(c) for c in configs}) == len(configs)
+
+
+def test_find_root_from_a_subfolder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("MMGSD_ROOT", raising=False)
+    (tmp_path / "environment.lock").touch()
+    (tmp_path / "notebooks" / "deep").mkdir(parents=True)
+    assert find_root(tmp_path / "notebooks" / "deep") == tmp_path
+
+
+def test_find_root_prefers_the_environment_variable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MMGSD_ROOT", str(tmp_path))
+    assert find_root() == tmp_path
+
+
+def test_find_root_without_a_repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("MMGSD_ROOT", raising=False)
+    monkeypatch.setattr(config_module, "__file__", str(tmp_path / "site" / "config.py"))
+    with pytest.raises(FileNotFoundError, match="environment.lock.*MMGSD_ROOT"):
+        find_root(tmp_path)

@@ -1,0 +1,184 @@
+"""The data set on disk: what is written is read back, whatever is damaged is refused with the file's name."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from mmgsd.dataset import DatasetError, check_dataset, encode_image, encode_mask, load_dataset, sample_pairs
+
+IMAGE, MASK = "images/00000.webp", "masks/00000.png"
+
+
+def edit_labels(folder: Path, edit: Callable[[pd.DataFrame], pd.DataFrame | None]) -> None:
+    labels = pd.read_parquet(folder / "labels.parquet")
+    edited = edit(labels)
+    (labels if edited is None else edited).to_parquet(folder / "labels.parquet", index=False)
+
+
+def set_cell(column: str, change: Callable[[np.ndarray], object]) -> Callable[[Path], None]:
+    """Replaces the first row's value of a column by ``change`` of it."""
+
+    def edit(labels: pd.DataFrame) -> None:
+        labels[column] = [change(labels[column].iloc[0].copy()), *labels[column].iloc[1:]]
+
+    return lambda folder: edit_labels(folder, edit)
+
+
+def set_info(**values: object) -> Callable[[Path], None]:
+    def damage(folder: Path) -> None:
+        path = folder / "dataset.json"
+        path.write_text(json.dumps(json.loads(path.read_text()) | values))
+
+    return damage
+
+
+def truncate(name: str) -> Callable[[Path], None]:
+    return lambda folder: (folder / name).write_bytes((folder / name).read_bytes()[:-30])
+
+
+def empty_mask(folder: Path) -> None:
+    (folder / MASK).write_bytes(encode_mask(np.zeros((485, 485), dtype=bool)))
+
+
+def drop_key(folder: Path) -> None:
+    info = json.loads((folder / "dataset.json").read_text())
+    (folder / "dataset.json").write_text(json.dumps({k: v for k, v in info.items() if k != "symmetry"}))
+
+
+def with_nan(xy: np.ndarray) -> np.ndarray:
+    xy[7] = np.nan
+    return xy
+
+
+def with_far_point(xy: np.ndarray) -> np.ndarray:
+    xy[:2] = 900.0
+    return xy
+
+
+DAMAGES = {
+    "image missing": (lambda folder: (folder / IMAGE).unlink(), f"{IMAGE} is missing"),
+    "image truncated": (truncate(IMAGE), f"{IMAGE} is missing, truncated"),
+    "image empty": (lambda folder: (folder / IMAGE).write_bytes(b""), f"{IMAGE} is missing, truncated"),
+    "image of another size": (
+        lambda folder: (folder / IMAGE).write_bytes(encode_image(np.zeros((480, 640, 3), np.uint8))),
+        f"{IMAGE} is 640 x 480 px, dataset.json says 485 x 485",
+    ),
+    "mask missing": (lambda folder: (folder / MASK).unlink(), f"{MASK} is missing"),
+    "mask truncated": (truncate(MASK), f"{MASK} is missing, truncated"),
+    "mask elsewhere": (empty_mask, f"{MASK}: 625 of 625 visible points lie off the mask"),
+    "table missing": (lambda folder: (folder / "labels.parquet").unlink(), "labels.parquet is missing"),
+    "table truncated": (truncate("labels.parquet"), "labels.parquet is missing, truncated"),
+    "columns missing": (
+        lambda folder: edit_labels(folder, lambda t: t.drop(columns=["visible", "view"])),
+        r"labels.parquet lacks the columns \['view', 'visible'\]",
+    ),
+    "rows missing": (lambda folder: edit_labels(folder, lambda t: t[1:]), "labels.parquet has .*'train': 3"),
+    "xy too short": (set_cell("xy", lambda xy: xy[:-2]), "labels.parquet: xy of row 0 is not of length 1250"),
+    "xy absent": (set_cell("xy", lambda xy: None), "labels.parquet: xy of row 0 is not of length 1250"),
+    "visible too long": (set_cell("visible", lambda v: [*v, True]), "visible of row 0 is not of length 625"),
+    "pose too short": (set_cell("camera_pose", lambda v: v[:12]), "camera_pose of row 0 is not of length 16"),
+    "xy not finite": (set_cell("xy", with_nan), "labels.parquet: xy holds values that are not finite"),
+    "xy outside": (set_cell("xy", with_far_point), f"labels.parquet: a visible point of {MASK} lies outside"),
+    "nothing visible": (set_cell("visible", lambda v: v & False), f"{MASK}: no material point is visible"),
+    "another format": (set_info(format=2), "dataset.json has format 2, this version reads 1"),
+    "keys missing": (drop_key, r"dataset.json lacks the keys \['symmetry'\]"),
+    "no JSON": (lambda folder: (folder / "dataset.json").write_text("{"), "dataset.json is no JSON"),
+    "shared simulation": (
+        lambda folder: edit_labels(folder, lambda t: t.assign(episode=0)),
+        r"cloth: simulations \[0\] are in both splits",
+    ),
+}
+
+
+@pytest.mark.parametrize(("damage", "message"), DAMAGES.values(), ids=DAMAGES)
+def test_damage_is_refused(tiny_dataset: Callable[..., Path], damage: Callable[[Path], None], message: str) -> None:
+    folder = tiny_dataset()
+    damage(folder)
+    with pytest.raises(DatasetError, match=message):
+        check_dataset(folder)
+
+
+@pytest.mark.parametrize("object", ["cloth", "rope"])
+def test_whole_data_set_passes(tiny_dataset: Callable[..., Path], object: str) -> None:
+    checked = check_dataset(tiny_dataset(object=object, n_train=4, n_test=2))
+    assert checked.images.to_dict() == {"train": 4, "test": 2}
+
+
+def test_labels_come_back(cloth_dataset: Path) -> None:
+    data, stored = load_dataset(cloth_dataset, "test"), pd.read_parquet(cloth_dataset / "labels.parquet")
+    assert (data.xy.shape, data.visible.shape, len(data)) == ((4, 625, 2), (4, 625), 4)
+    np.testing.assert_array_equal(data.xy[0].ravel(), stored[stored.split == "test"].xy.iloc[0])
+    assert data.episode.tolist() == stored[stored.split == "test"].episode.tolist()
+
+
+@pytest.mark.parametrize(("object", "size"), [("cloth", (485, 485)), ("rope", (640, 480))])
+def test_images_have_the_objects_size(tiny_dataset: Callable[..., Path], object: str, size: tuple[int, int]) -> None:
+    data = load_dataset(tiny_dataset(object=object))
+    assert data.size == size
+    assert data.load_image(0).shape == (size[1], size[0], 3)
+    assert data.load_mask(0).shape == (size[1], size[0])
+
+
+def test_images_are_lossless(tiny_dataset: Callable[..., Path], rng: np.random.Generator) -> None:
+    data = load_dataset(tiny_dataset())
+    image = rng.integers(0, 256, (485, 485, 3), dtype=np.uint8)
+    (data.folder / IMAGE).write_bytes(encode_image(image))
+    np.testing.assert_array_equal(data.load_image(0), image)
+
+
+def test_masks_are_lossless(tiny_dataset: Callable[..., Path], rng: np.random.Generator) -> None:
+    data = load_dataset(tiny_dataset())
+    mask = rng.random((485, 485)) < 0.5
+    (data.folder / MASK).write_bytes(encode_mask(mask))
+    np.testing.assert_array_equal(data.load_mask(0), mask)
+
+
+def test_groups_are_data(cloth_dataset: Path) -> None:
+    data = load_dataset(cloth_dataset)
+    assert (data.group().name, data.group().order, data.group("d4").order) == ("c4", 4, 8)
+    with pytest.raises(ValueError, match="group must be one of 'identity', .*got 'c3'"):
+        data.group("c3")
+
+
+def test_unknown_split(cloth_dataset: Path) -> None:
+    with pytest.raises(ValueError, match=r"split must be one of \('train', 'test'\), got 'validation'"):
+        load_dataset(cloth_dataset, "validation")
+
+
+def test_no_data_set(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="dataset.json does not exist"):
+        load_dataset(tmp_path)
+
+
+EPISODES = np.repeat(np.arange(4), 3)
+
+
+def test_pairs_are_of_different_simulations(rng: np.random.Generator) -> None:
+    first, second = sample_pairs(EPISODES, 500, rng).T
+    assert (EPISODES[first] != EPISODES[second]).all()
+
+
+def test_pairs_of_one_simulation_are_never_one_image(rng: np.random.Generator) -> None:
+    first, second = sample_pairs(np.zeros(5, dtype=int), 100, rng, same_episode=True).T
+    assert (first != second).all()
+
+
+def test_pairs_do_not_repeat_while_images_suffice(rng: np.random.Generator) -> None:
+    pairs = sample_pairs(EPISODES, 12 * 9, rng)
+    assert len(np.unique(pairs, axis=0)) == 12 * 9
+
+
+def test_pairs_are_those_of_the_seed() -> None:
+    one, two = (sample_pairs(EPISODES, 20, np.random.default_rng(3)) for _ in range(2))
+    np.testing.assert_array_equal(one, two)
+
+
+def test_one_image_makes_no_pair(rng: np.random.Generator) -> None:
+    with pytest.raises(ValueError, match="episode must hold at least 2 images to make a pair, got 1"):
+        sample_pairs(np.zeros(1, dtype=int), 1, rng)

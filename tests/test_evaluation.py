@@ -1,0 +1,185 @@
+"""Evaluation: the truth scores zero, tables hold one row a query, finished tables are left alone."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from mmgsd import evaluation
+from mmgsd.config import EvaluateConfig, TrainConfig
+from mmgsd.dataset import Dataset, load_dataset
+from mmgsd.evaluation import (
+    BANDWIDTHS,
+    calibrate_bandwidth,
+    choose_points,
+    evaluate_baseline,
+    evaluate_model,
+    load_queries,
+    summarise,
+    write_results,
+)
+from mmgsd.matching import Matcher
+from mmgsd.network import build_network
+
+CONFIG = EvaluateConfig(pairs=3, points=5)
+CLOTH_SIDE_PX = 240.0  # of the synthetic cloths
+
+
+def ask_baseline(method: str, dataset: Path, out: Path, config: EvaluateConfig = CONFIG) -> pd.DataFrame:
+    return load_queries(evaluate_baseline(method, dataset, config, out, progress=False))
+
+
+def answer_with_the_truth(group: str, shift: float) -> object:
+    """Stands for a model that knows the labels: the true modes, moved by ``shift`` px along x."""
+
+    def make(matcher: object, data: Dataset) -> evaluation.Answer:
+        def answer(first: int, second: int, xy: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            modes = np.full((len(xy), n.max(), 2), np.nan)
+            for row, point in enumerate(choose_points(CONFIG.points)):
+                modes[row, : n[row]] = data.xy[second, data.group(group).distinct_modes(point)[::-1]] + [shift, 0]
+            return modes, np.zeros(len(xy))
+
+        return answer
+
+    return make
+
+
+@pytest.fixture
+def ask_oracle(monkeypatch: pytest.MonkeyPatch, cloth_dataset: Path, tmp_path: Path) -> object:
+    def ask(group: str = "", *, shift: float = 0.0) -> pd.DataFrame:
+        monkeypatch.setattr(evaluation.Matcher, "load", lambda path: None)
+        monkeypatch.setattr(evaluation, "_model_answer", answer_with_the_truth(group, shift))
+        out = tmp_path / f"oracle{group}.parquet"
+        return load_queries(evaluate_model(Path(), cloth_dataset, CONFIG, out, group=group, progress=False))
+
+    return ask
+
+
+@pytest.mark.parametrize("group", ["", "identity", "c2", "v4", "d4"])
+def test_the_truth_has_no_error(ask_oracle: object, group: str) -> None:
+    queries = ask_oracle(group)
+    assert (queries.rmse_px == 0).all()
+    assert (queries["pck@5px"] == 1).all()
+
+
+def test_a_shifted_truth_is_wrong_by_the_shift(ask_oracle: object) -> None:
+    queries = ask_oracle(shift=3.0)
+    np.testing.assert_allclose(queries[["rmse_px", "nearest_px"]], 3.0, rtol=1e-5)
+
+
+def test_coinciding_modes_are_merged(ask_oracle: object) -> None:
+    queries = ask_oracle()  # points 0, 156, 312, 468, 624 of 625: the third is the cloth's centre
+    assert queries[queries["pair"] == 0].n.tolist() == [4, 4, 1, 4, 4]
+
+
+def test_one_row_a_query(cloth_dataset: Path, tmp_path: Path) -> None:
+    queries = ask_baseline("centre", cloth_dataset, tmp_path / "centre.parquet")
+    assert list(queries.columns) == [
+        "pair", "image0", "image1", "point", "visible", "n", "entropy", "rmse_px", "nearest_px",
+        "pck@5px", "pck@10px", "pck@20px",
+    ]  # fmt: skip
+    assert len(queries) == CONFIG.pairs * CONFIG.points
+    assert not queries.duplicated(["pair", "point"]).any()
+    assert np.isfinite(queries.drop(columns="visible").to_numpy(dtype=float)).all()
+
+
+def test_pairs_show_different_simulations(cloth_dataset: Path, tmp_path: Path) -> None:
+    queries = ask_baseline("centre", cloth_dataset, tmp_path / "centre.parquet")
+    episode = load_dataset(cloth_dataset, "test").episode
+    assert (episode[queries.image0] != episode[queries.image1]).all()
+
+
+def test_methods_are_asked_the_same(cloth_dataset: Path, tmp_path: Path) -> None:
+    one, two = (ask_baseline(m, cloth_dataset, tmp_path / f"{m}.parquet") for m in ("centre", "random"))
+    questions = ["pair", "image0", "image1", "point", "visible", "n"]
+    pd.testing.assert_frame_equal(one[questions], two[questions])
+
+
+def test_the_centres_error_on_a_flat_square(cloth_dataset: Path, tmp_path: Path) -> None:
+    queries = ask_baseline("centre", cloth_dataset, tmp_path / "centre.parquet").set_index("point").rmse_px
+    corner, inner = CLOTH_SIDE_PX / np.sqrt(2), CLOTH_SIDE_PX / 24 * np.hypot(6, 6)  # 156 is row 6, column 6
+    assert queries[0].tolist() == pytest.approx([corner] * 3, abs=1)
+    assert queries[156].tolist() == pytest.approx([inner] * 3, abs=1)
+    assert queries[312].tolist() == pytest.approx([0] * 3, abs=1)
+
+
+@pytest.mark.parametrize("method", ["sift", "orb"])
+def test_classical_descriptors_answer(cloth_dataset: Path, tmp_path: Path, method: str) -> None:
+    config = EvaluateConfig(pairs=1, points=3)
+    queries = ask_baseline(method, cloth_dataset, tmp_path / f"{method}.parquet", config)
+    assert len(queries) == 3
+    assert np.isfinite(queries.rmse_px).all()
+
+
+def test_unknown_baseline(cloth_dataset: Path, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="method must be one of .*'sift', 'orb', 'centre', 'random'.*, got 'hog'"):
+        ask_baseline("hog", cloth_dataset, tmp_path / "hog.parquet")
+
+
+def test_a_finished_table_is_left_alone(tmp_path: Path) -> None:
+    out = tmp_path / "done.parquet"
+    out.write_bytes(b"finished")
+    assert evaluate_baseline("centre", tmp_path / "no data set", CONFIG, out) == out
+    assert evaluate_model(tmp_path / "no weights", tmp_path / "no data set", CONFIG, out) == out
+    assert out.read_bytes() == b"finished"
+
+
+def test_overwrite_asks_again(cloth_dataset: Path, tmp_path: Path) -> None:
+    out = tmp_path / "centre.parquet"
+    out.write_bytes(b"stale")
+    evaluate_baseline("centre", cloth_dataset, CONFIG, out, overwrite=True, progress=False)
+    assert len(load_queries(out)) == 15
+    assert list(tmp_path.iterdir()) == [out]
+
+
+def test_points_spread_evenly() -> None:
+    assert choose_points(5).tolist() == [0, 156, 312, 468, 624]
+    assert choose_points(625).tolist() == list(range(625))
+    assert choose_points(1).tolist() == [0]
+
+
+@pytest.mark.parametrize("count", range(1, 626, 39))
+def test_as_many_points_as_asked_for(count: int) -> None:
+    assert len(choose_points(count)) == count
+
+
+def test_summary_separates_visible_sources(tmp_path: Path) -> None:
+    shares = dict.fromkeys(["pck@5px", "pck@10px", "pck@20px"], 1.0)
+    table = pd.DataFrame({"visible": [True, True, False], "rmse_px": [1.0, 3.0, 8.0], "nearest_px": 1.0, **shares})
+    table.to_parquet(tmp_path / "mmgsd.parquet")
+    summary = summarise({"mmgsd": tmp_path / "mmgsd.parquet"})["mmgsd"]
+    assert (summary["rmse_mean"], summary["queries"]) == (2.0, 2)
+    assert (summary["rmse_mean_all"], summary["queries_all"]) == (4.0, 3)
+
+
+def test_results_are_json(tmp_path: Path) -> None:
+    path = write_results({"cloth": {"mmgsd": {"rmse_mean": 1.5}}}, tmp_path / "new" / "rmse.json")
+    assert json.loads(path.read_text()) == {"cloth": {"mmgsd": {"rmse_mean": 1.5}}}
+    assert list(path.parent.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("method", ["pcl", "spcl"])
+def test_calibration_picks_a_candidate(cloth_dataset: Path, method: str) -> None:
+    torch.manual_seed(0)
+    config = TrainConfig(input_px=64, descriptor_dim=4, method=method, margin=0.6)
+    matcher = Matcher(build_network("lite0", 4, pretrained=False), config, modes=4, size=(485, 485), device="cpu")
+    bandwidth = calibrate_bandwidth(matcher, load_dataset(cloth_dataset), pairs=2, points=5)
+    assert bandwidth == matcher.bandwidth
+    assert bandwidth in [pytest.approx(0.6 * b) for b in BANDWIDTHS]
+
+
+def test_a_model_answers_every_query(cloth_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = dataclasses.replace(TrainConfig(), input_px=64, descriptor_dim=4)
+    matcher = Matcher(build_network("lite0", 4, pretrained=False), config, modes=4, size=(485, 485), device="cpu")
+    monkeypatch.setattr(evaluation.Matcher, "load", lambda path: matcher)
+    queries = load_queries(
+        evaluate_model(Path(), cloth_dataset, CONFIG, tmp_path / "mmgsd.parquet", group="d4", progress=False)
+    )
+    assert np.isfinite(queries.rmse_px).all()
+    assert queries[queries["pair"] == 0].n.tolist() == [4, 4, 1, 4, 4]  # points of a diagonal under d4

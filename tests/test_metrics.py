@@ -1,0 +1,98 @@
+"""Metrics: hand values, and the assignment's independence of the modes' order."""
+
+from __future__ import annotations
+
+from itertools import permutations
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from mmgsd.metrics import aggregate, compute_mode_errors, compute_query_errors
+
+TRUE = np.array([[[0.0, 0.0], [100.0, 0.0]]])
+MODES = np.array([[[100.0, 8.0], [3.0, 4.0]]])  # 8 px from the second, 5 px from the first
+
+
+@st.composite
+def modes_and_true(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray]:
+    pixels = st.floats(0, 500, width=32)
+    shape = (1, draw(st.integers(1, 6)), 2)
+    return draw(arrays(float, shape, elements=pixels)), draw(arrays(float, shape, elements=pixels))
+
+
+def least_total(modes: np.ndarray, true: np.ndarray) -> float:
+    orders = permutations(range(len(modes)))
+    return min(np.square(modes[list(order)] - true).sum() for order in orders)
+
+
+def test_errors_by_hand() -> None:
+    np.testing.assert_allclose(compute_mode_errors(MODES, TRUE), [[5.0, 8.0]])
+
+
+def test_query_metrics_by_hand() -> None:
+    metrics = compute_query_errors(MODES, TRUE)
+    assert {name: float(value[0]) for name, value in metrics.items()} == pytest.approx(
+        {"rmse_px": np.sqrt((25 + 64) / 2), "nearest_px": 8.0, "pck@5px": 0.5, "pck@10px": 1.0, "pck@20px": 1.0}
+    )
+
+
+def test_nearest_is_of_the_most_probable_mode() -> None:
+    metrics = compute_query_errors(MODES[:, ::-1], TRUE)
+    assert metrics["nearest_px"][0] == pytest.approx(5.0)
+
+
+def test_two_modes_on_one_match_leave_the_other_missed() -> None:
+    errors = compute_mode_errors(np.array([[[0.0, 0.0], [0.0, 1.0]]]), TRUE)
+    assert sorted(errors[0]) == pytest.approx([0.0, np.hypot(100, 1)])
+
+
+@given(modes_and_true(), st.randoms(use_true_random=False))
+def test_order_of_modes_does_not_matter(pair: tuple[np.ndarray, np.ndarray], random: object) -> None:
+    modes, true = pair
+    order = list(range(modes.shape[1]))
+    random.shuffle(order)
+    one, two = (np.square(compute_mode_errors(m, true)).sum() for m in (modes, modes[:, order]))
+    assert one == pytest.approx(two, rel=1e-9, abs=1e-9)
+
+
+@given(modes_and_true())
+def test_assignment_has_the_least_total_squared_error(pair: tuple[np.ndarray, np.ndarray]) -> None:
+    modes, true = pair
+    found = np.square(compute_mode_errors(modes, true)).sum()
+    assert found == pytest.approx(least_total(modes[0], true[0]), rel=1e-9, abs=1e-9)
+
+
+def test_eight_modes_are_assigned_back(rng: np.random.Generator) -> None:
+    true = rng.uniform(0, 480, (5, 8, 2))
+    errors = compute_mode_errors(true[:, rng.permutation(8)] + 0.01, true)
+    np.testing.assert_allclose(errors, np.full((5, 8), 0.01 * np.sqrt(2)))
+
+
+def test_eight_modes_beside_brute_force(rng: np.random.Generator) -> None:
+    modes, true = rng.uniform(0, 480, (2, 1, 8, 2))
+    found = np.square(compute_mode_errors(modes, true)).sum()
+    assert found == pytest.approx(least_total(modes[0], true[0]))
+
+
+@pytest.mark.parametrize("n", [4, 8])
+def test_no_query_no_error(n: int) -> None:
+    assert compute_mode_errors(np.zeros((0, n, 2)), np.zeros((0, n, 2))).shape == (0, n)
+
+
+@pytest.mark.parametrize(("modes", "true"), [((1, 2, 2), (1, 3, 2)), ((2, 2), (2, 2))])
+def test_shapes_must_agree(modes: tuple[int, ...], true: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match="modes and true must share one shape"):
+        compute_mode_errors(np.zeros(modes), np.zeros(true))
+
+
+def test_aggregate_by_hand() -> None:
+    columns = {"nearest_px": [1.0, 1.0, 4.0], "pck@5px": [1.0, 0.5, 0.0], "pck@10px": 1.0, "pck@20px": 1.0}
+    summary = aggregate(pd.DataFrame({"rmse_px": [3.0, 4.0, 12.0], **columns}))
+    assert summary == {
+        "rmse_mean": 6.3333, "rmse_pooled": 7.5056, "median": 4.0, "nearest_mean": 2.0,
+        "pck@5px": 0.5, "pck@10px": 1.0, "pck@20px": 1.0, "queries": 3,
+    }  # fmt: skip

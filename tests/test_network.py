@@ -1,0 +1,97 @@
+"""Networks: the shapes they give, the names they bear, and how their grid of descriptors maps to pixels."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from mmgsd.network import (
+    ResNet34Trunk,
+    build_network,
+    compute_cell_centres,
+    compute_input_size,
+    sample_descriptors,
+)
+
+BATCH_NORM = ("weight", "bias", "running_mean", "running_var", "num_batches_tracked")
+
+
+def list_resnet34_keys() -> set[str]:
+    """torchvision's names for ResNet-34, without the classifier's two."""
+    keys = {"conv1.weight"} | {f"bn1.{name}" for name in BATCH_NORM}
+    for stage, blocks in enumerate((3, 4, 6, 3), start=1):
+        for block in range(blocks):
+            for layer in (1, 2):
+                keys.add(f"layer{stage}.{block}.conv{layer}.weight")
+                keys |= {f"layer{stage}.{block}.bn{layer}.{name}" for name in BATCH_NORM}
+        if stage > 1:
+            keys.add(f"layer{stage}.0.downsample.0.weight")
+            keys |= {f"layer{stage}.0.downsample.1.{name}" for name in BATCH_NORM}
+    return keys
+
+
+def test_resnet34_bears_torchvisions_names() -> None:
+    state = ResNet34Trunk().state_dict()
+    assert len(state) == 216
+    assert set(state) == list_resnet34_keys()
+
+
+def test_resnet34_has_torchvisions_shapes() -> None:
+    state = ResNet34Trunk().state_dict()
+    assert sum(v.numel() for k, v in state.items() if k.endswith((".weight", ".bias"))) == 21_797_672 - 513_000
+    assert state["layer4.0.downsample.0.weight"].shape == (512, 256, 1, 1)
+
+
+@pytest.mark.parametrize(("height", "width"), [(64, 64), (64, 96), (61, 75)])
+@pytest.mark.parametrize(("name", "stride"), [("lite0", 4), ("resnet34", 1)])
+def test_output_shape(name: str, stride: int, height: int, width: int) -> None:
+    network = build_network(name, 5, pretrained=False).eval()
+    with torch.no_grad():
+        descriptors = network(torch.rand(2, 3, height, width))
+    assert descriptors.shape == (2, 5, height // stride, width // stride)
+    assert descriptors.dtype == torch.float32
+
+
+@pytest.mark.parametrize("name", ["lite0", "resnet34"])
+def test_every_used_parameter_gets_a_gradient(name: str) -> None:
+    network = build_network(name, 4, pretrained=False)
+    network(torch.rand(2, 3, 64, 64)).square().sum().backward()
+    assert [n for n, p in network.named_parameters() if p.grad is None] == []
+
+
+def test_unknown_network() -> None:
+    with pytest.raises(ValueError, match="network must be 'lite0' or 'resnet34', got 'vgg'"):
+        build_network("vgg", 3)
+
+
+@pytest.mark.parametrize(
+    ("size", "input_px", "expected"),
+    [
+        ((485, 485), 128, (128, 128)),
+        ((640, 480), 160, (160, 120)),
+        ((640, 480), 64, (64, 48)),
+        ((900, 20), 64, (64, 16)),
+    ],
+)
+def test_input_size(size: tuple[int, int], input_px: int, expected: tuple[int, int]) -> None:
+    assert compute_input_size(size, input_px) == expected
+
+
+def test_cell_centres() -> None:
+    xs, ys = compute_cell_centres((8, 6), (3, 4))  # cells of 2 x 2 px
+    assert xs.tolist() == [0.5, 2.5, 4.5, 6.5]
+    assert ys.tolist() == [0.5, 2.5, 4.5]
+
+
+def test_descriptors_at_cell_centres_are_the_cells() -> None:
+    grid = torch.arange(12.0).view(1, 1, 3, 4)
+    xs, ys = compute_cell_centres((485, 300), (3, 4))
+    xy = torch.stack(torch.meshgrid(xs, ys, indexing="xy"), -1).view(1, -1, 2)
+    torch.testing.assert_close(sample_descriptors(grid, xy, (485, 300)), grid.view(1, 12, 1), rtol=0, atol=1e-4)
+
+
+def test_descriptors_between_cells_are_bilinear() -> None:
+    grid = torch.tensor([[[[0.0, 4.0], [8.0, 16.0]]]])  # cells of 2 x 2 px, centres at 0.5 and 2.5
+    xy = torch.tensor([[[1.0, 1.5], [1.5, 1.5], [0.5, 2.0]]])
+    # (1, 1.5): a quarter across, half down: 0.5 * (0.75 * 0 + 0.25 * 4) + 0.5 * (0.75 * 8 + 0.25 * 16) = 5.5
+    torch.testing.assert_close(sample_descriptors(grid, xy, (4, 4)), torch.tensor([[[5.5], [7.0], [6.0]]]))

@@ -1,0 +1,146 @@
+"""Labels of rendered cloths against their pixels."""
+
+import json
+import os
+import subprocess
+import sys
+import zipfile
+
+import numpy as np
+import pytest
+from PIL import Image, ImageDraw
+from scipy.ndimage import binary_erosion, distance_transform_edt
+
+bpy = pytest.importorskip("bpy")
+
+from mmgsd.config import RenderConfig  # noqa: E402
+from mmgsd.scene import cloth, episode, randomize, render  # noqa: E402
+
+SIZE = (485, 485)
+
+
+@pytest.fixture(scope="module")
+def folded():
+    """A folded cloth seen by one camera at 16 samples: (deformed, camera, image, mask)."""
+    rng = np.random.default_rng(1)
+    scene = render.reset_scene()
+    vertices, _ = cloth.deform(rng, "corner")
+    deformed = cloth.hand_over(vertices, {})
+    floor = episode.add_floor()
+    render.setup_cycles(scene, SIZE, 16)
+    camera, _ = randomize.draw_camera(rng, deformed.points, SIZE, 180.0)
+    render.place_camera(scene, camera)
+    randomize.draw_light(rng, scene)
+    colour, _ = randomize.draw_background(rng, floor)
+    randomize.draw_object_material(rng, deformed.mesh, colour)
+    image, mask = render.render_image(scene, seed=0)
+    return deformed, camera, image, mask
+
+
+def fill_triangles(mesh, camera):
+    """The projected mesh filled at three times the resolution, taken at pixel centres: (H, W) bool."""
+    mesh.data.calc_loop_triangles()
+    xy = camera.project(render.read_vertices(mesh.data))
+    canvas = Image.new("1", (3 * SIZE[0], 3 * SIZE[1]))
+    pen = ImageDraw.Draw(canvas)
+    for triangle in mesh.data.loop_triangles:
+        pen.polygon([tuple(3 * xy[i] + 1) for i in triangle.vertices], fill=1)
+    return np.asarray(canvas)[1::3, 1::3]
+
+
+def outline(mask):
+    return mask & ~binary_erosion(mask, border_value=1)
+
+
+def outline_distances(a, b):
+    """Distances (px) from each outline pixel of mask a to the outline of mask b."""
+    return distance_transform_edt(~outline(b))[outline(a)]
+
+
+def test_projected_outline_is_the_masks_outline(folded):
+    deformed, camera, _, mask = folded
+    filled = fill_triangles(deformed.mesh, camera)
+    distances = np.concatenate([outline_distances(filled, mask), outline_distances(mask, filled)])
+    assert np.quantile(distances, 0.99) <= 1.5
+
+
+def test_visible_points_lie_in_the_mask(folded):
+    deformed, camera, _, mask = folded
+    visible = render.find_visible(deformed, render.build_bvh(deformed.mesh), camera)
+    x, y = np.rint(camera.project(deformed.points[visible])).astype(int).T
+    assert np.mean(distance_transform_edt(~mask)[y, x] <= 1.5) > 0.99
+    assert 0.5 < visible.mean() < 1.0  # the corner hides a part of the cloth
+
+
+def test_flat_cloth_is_all_visible_and_its_corners_are_the_masks_corners():
+    rng = np.random.default_rng(0)
+    scene = render.reset_scene()
+    deformed = cloth.hand_over(cloth.flat_vertices(), {})
+    render.setup_cycles(scene, SIZE, 4)
+    camera, _ = randomize.draw_camera(rng, deformed.points, SIZE, 180.0)
+    render.place_camera(scene, camera)
+    randomize.draw_object_material(rng, deformed.mesh, (0.0, 0.0, 0.0, 1.0))
+    _, mask = render.render_image(scene, seed=0)
+    xy = camera.project(deformed.points).reshape(25, 25, 2)
+    y, x = np.nonzero(mask)
+    for corner in (xy[0, 0], xy[0, -1], xy[-1, 0], xy[-1, -1]):
+        outwards = (corner - xy[12, 12]) / np.linalg.norm(corner - xy[12, 12])
+        reach = (np.stack([x, y], axis=1) - corner) @ outwards
+        assert abs(reach.max()) <= 2.5  # 1.5 px, and Catmull-Clark rounds the very corner
+    assert render.find_visible(deformed, render.build_bvh(deformed.mesh), camera).all()
+
+
+@pytest.mark.parametrize("limit", [45.0, 180.0])
+def test_turn_stays_within_the_limit(limit):
+    rng = np.random.default_rng(0)
+    points = cloth.flat_vertices()[::7]
+    for _ in range(40):
+        camera, turn = randomize.draw_camera(rng, points, SIZE, limit)
+        right = camera.project(np.array([[0.0, 0, 0], [0.1, 0, 0]]))
+        dx, dy = right[1] - right[0]
+        seen = np.degrees(np.arctan2(dy, dx))  # clockwise in the image
+        assert abs(turn) <= limit
+        assert abs((seen - turn + 180) % 360 - 180) < 3.0  # tilt shears a little
+        assert camera.contains(camera.project(points)).mean() >= 0.95
+
+
+def test_a_ray_that_meets_nothing_leaves_its_point_visible():
+    deformed, bvh = render.DeformedObject(None, np.array([[0.0, 0, 0]]), 0.01, {}), render.BVHTree.FromPolygons([], [])
+    camera, _ = randomize.draw_camera(np.random.default_rng(0), deformed.points, SIZE, 45.0)
+    assert render.find_visible(deformed, bvh, camera).tolist() == [True]
+
+
+def test_unknown_split_and_state_are_named():
+    with pytest.raises(ValueError, match="split must be one of train, test"):
+        episode.render_episode(RenderConfig(), "tset", 0, 1)
+    with pytest.raises(ValueError, match="state must be one of"):
+        cloth.deform(np.random.default_rng(0), "ironed")
+
+
+def run_job(tmp_path, name, threads, **changes):
+    job = {"config": {"samples": 1}, "split": "test", "episodes": [[1, 2]], "out": str(tmp_path / name), **changes}
+    environment = {**os.environ, "MMGSD_THREADS": str(threads)}
+    command = [sys.executable, "-m", "mmgsd.scene"]
+    return subprocess.run(command, input=json.dumps(job), text=True, capture_output=True, env=environment)
+
+
+def test_jobs_archive_holds_every_view_and_does_not_depend_on_the_threads(tmp_path):
+    for name, threads in (("a.zip", 1), ("b.zip", 2)):
+        done = run_job(tmp_path, name, threads)
+        assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    assert (tmp_path / "a.zip").read_bytes() == (tmp_path / "b.zip").read_bytes()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.zip", "b.zip"]
+    with zipfile.ZipFile(tmp_path / "a.zip") as archive:
+        labels = json.loads(archive.read("labels.json"))
+        assert [(row["episode"], row["view"], row["split"]) for row in labels] == [(1, 0, "test"), (1, 1, "test")]
+        assert np.shape(labels[0]["xy"]) == (625, 2)
+        with archive.open("000001_01.webp") as image, archive.open("000001_01_mask.png") as mask:
+            assert np.asarray(Image.open(image)).shape == (485, 485, 3)
+            assert np.asarray(Image.open(mask)).dtype == bool
+
+
+def test_a_failed_job_says_why_and_leaves_nothing(tmp_path):
+    done = run_job(tmp_path, "a.zip", 1, config={"sampels": 1})
+    assert done.returncode == 1
+    assert "did you mean 'samples'" in done.stderr
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,199 @@
+"""Training: every method runs, a killed run ends with the same weights, what does not fit is refused."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import load_file
+
+from mmgsd import training
+from mmgsd.config import METHODS, TrainConfig
+from mmgsd.dataset import load_dataset
+from mmgsd.matching import Matcher
+from mmgsd.training import (
+    CHECKPOINT,
+    LOG,
+    compute_learning_rate,
+    compute_loss,
+    compute_sigma,
+    load_training_images,
+    make_batch,
+    train_model,
+)
+
+TINY = TrainConfig(steps=3, batch=4, pairs=6, queries=16, input_px=64, descriptor_dim=8)
+ONE_STEP, LONGER = dataclasses.replace(TINY, steps=1), dataclasses.replace(TINY, steps=4)
+HANG_IN_STEP = 2
+
+KILLED_RUN = f"""
+import sys, time
+from pathlib import Path
+from mmgsd import training
+from mmgsd.config import TrainConfig, from_dict
+import json
+
+training.CHECKPOINT_SECONDS = 0
+make_batch, calls = training.make_batch, []
+
+def hang(*arguments):
+    calls.append(1)
+    if len(calls) > {HANG_IN_STEP}:
+        print("in the middle of a step", flush=True)
+        time.sleep(600)
+    return make_batch(*arguments)
+
+training.make_batch = hang
+config = from_dict(TrainConfig, json.loads(sys.argv[1]))
+training.train_model(config, Path(sys.argv[2]), Path(sys.argv[3]), device="cpu", progress=False)
+"""
+
+
+def train(config: TrainConfig, dataset: Path, folder: Path, **options: bool) -> Path:
+    return train_model(config, dataset, folder, device="cpu", progress=False, **options)
+
+
+def train_and_kill(config: TrainConfig, dataset: Path, folder: Path) -> None:
+    """Start training in a child process and kill it in the middle of a step, after some checkpoints."""
+    arguments = [json.dumps(dataclasses.asdict(config)), str(dataset), str(folder)]
+    command = [sys.executable, "-c", KILLED_RUN, *arguments]
+    with subprocess.Popen(command, cwd=Path(training.__file__).parents[1], stdout=subprocess.PIPE, text=True) as child:
+        assert child.stdout.readline() == "in the middle of a step\n"
+        child.kill()
+    assert child.returncode == -signal.SIGKILL
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_trains(cloth_dataset: Path, tmp_path: Path, method: str) -> None:
+    config = dataclasses.replace(TINY, method=method)
+    weights = train(config, cloth_dataset, tmp_path / "model")
+    log = pd.read_csv(tmp_path / "model" / LOG)
+    assert log.step.tolist() == [1, 2, 3]
+    assert np.isfinite(log.loss).all()
+    assert all(torch.isfinite(value).all() for value in load_file(weights).values())
+    matcher = Matcher.load(weights, device="cpu")
+    assert (matcher.config, matcher.modes) == (config, 1 if method in ("pcl", "unimodal") else 4)
+    assert not (tmp_path / "model" / CHECKPOINT).exists()
+
+
+def test_a_finished_model_is_returned_as_it_is(cloth_dataset: Path, tmp_path: Path) -> None:
+    weights = train(ONE_STEP, cloth_dataset, tmp_path)
+    before = weights.stat().st_mtime_ns
+    assert train(ONE_STEP, tmp_path / "no data set is opened", tmp_path) == weights
+    assert weights.stat().st_mtime_ns == before
+
+
+def test_overwrite_trains_again_to_the_same_weights(cloth_dataset: Path, tmp_path: Path) -> None:
+    first = train(ONE_STEP, cloth_dataset, tmp_path / "model").read_bytes()
+    (tmp_path / "model" / "stale").touch()
+    second = load_file(train(ONE_STEP, cloth_dataset, tmp_path / "model", overwrite=True))
+    assert not (tmp_path / "model" / "stale").exists()
+    (tmp_path / "first.safetensors").write_bytes(first)
+    torch.testing.assert_close(second, load_file(tmp_path / "first.safetensors"), rtol=0, atol=0)
+
+
+def test_a_killed_run_ends_with_the_same_weights(cloth_dataset: Path, tmp_path: Path) -> None:
+    train_and_kill(LONGER, cloth_dataset, tmp_path / "killed")
+    assert not (tmp_path / "killed" / training.WEIGHTS).exists()
+    assert torch.load(tmp_path / "killed" / CHECKPOINT, weights_only=True)["step"] == HANG_IN_STEP
+    resumed = load_file(train(LONGER, cloth_dataset, tmp_path / "killed"))
+    undisturbed = load_file(train(LONGER, cloth_dataset, tmp_path / "undisturbed"))
+    torch.testing.assert_close(resumed, undisturbed, rtol=0, atol=1e-6)
+    assert pd.read_csv(tmp_path / "killed" / LOG).step.tolist() == list(range(1, LONGER.steps + 1))
+
+
+def test_a_checkpoint_of_another_configuration(
+    cloth_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(training, "CHECKPOINT_SECONDS", 0)
+    monkeypatch.setattr(training._Run, "finish", lambda run, weights: weights)  # as if killed just before
+    train(ONE_STEP, cloth_dataset, tmp_path)
+    with pytest.raises(ValueError, match="checkpoint.pt belongs to another configuration: .*overwrite=True"):
+        train(dataclasses.replace(ONE_STEP, seed=1), cloth_dataset, tmp_path)
+
+
+def test_a_data_set_of_another_object(cloth_dataset: Path, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="object is 'rope', but .* shows a cloth"):
+        train(dataclasses.replace(TINY, object="rope", group="c2"), cloth_dataset, tmp_path)
+
+
+def test_a_group_that_is_not_stored(cloth_dataset: Path, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="group must be one of 'identity', .*'d4' for this data set, got 'c3'"):
+        train(dataclasses.replace(TINY, group="c3"), cloth_dataset, tmp_path)
+
+
+def test_the_rope_trains(tiny_dataset: Callable[..., Path], tmp_path: Path) -> None:
+    config = dataclasses.replace(TINY, object="rope", group="c2", steps=1)
+    with safe_open(train(config, tiny_dataset(object="rope"), tmp_path / "model"), "pt") as file:
+        assert (file.metadata()["modes"], file.metadata()["size"]) == ("2", "[640, 480]")
+
+
+def test_learns_a_single_batch() -> None:
+    """Descriptors that are free parameters come two nats closer than a uniform guess, ln 256."""
+    config = dataclasses.replace(TINY, sigma_px=16.0, sigma_start_px=16.0, augment=False)
+    xy = torch.tensor([[[60.0, 60], [420, 60], [420, 420], [60, 420]]] * 2)
+    seen = torch.ones(2, 4, dtype=torch.bool)
+    batch = training.Batch(torch.zeros(2, 3, 64, 64), torch.ones(2, 64, 64, dtype=torch.bool), xy, seen, seen)
+    permutations = torch.tensor([[0, 1, 2, 3], [1, 2, 3, 0], [2, 3, 0, 1], [3, 0, 1, 2]])
+    descriptors = torch.nn.Parameter(0.1 * torch.randn(2, 8, 16, 16, generator=torch.Generator().manual_seed(0)))
+    optimiser, values = torch.optim.Adam([descriptors], lr=0.1), []
+    for _ in range(100):
+        values.append(compute_loss(config, descriptors, batch, permutations, (485, 485), 0))
+        optimiser.zero_grad()
+        values[-1].backward()
+        optimiser.step()
+    assert values[-1] < values[0] - 2
+
+
+def test_hidden_points_are_not_asked(tiny_dataset: Callable[..., Path], rng: np.random.Generator) -> None:
+    images = load_training_images(load_dataset(tiny_dataset(object="rope")), 64)
+    config = dataclasses.replace(TINY, object="rope", group="c2", augment=False)
+    batch = make_batch(images, np.arange(2), config, rng, torch.device("cpu"))
+    np.testing.assert_array_equal(batch.askable, images.visible[:2])
+
+
+def test_augmented_points_stay_on_their_mask(cloth_dataset: Path, rng: np.random.Generator) -> None:
+    images = load_training_images(load_dataset(cloth_dataset), 128)
+    batch = make_batch(images, np.arange(4), TINY, rng, torch.device("cpu"))
+    scale = batch.mask.shape[-1] / images.size[0]
+    inner = torch.arange(625).view(25, 25)[1:-1, 1:-1].flatten()  # the outline itself may fall on either side
+    for mask, xy, inside in zip(batch.mask, batch.xy[:, inner], batch.inside[:, inner], strict=True):
+        column, row = ((xy[inside] + 0.5) * scale - 0.5).round().long().clamp(0, mask.shape[-1] - 1).T
+        assert mask[row, column].all()
+
+
+def test_images_in_memory_are_a_little_larger_than_the_input(cloth_dataset: Path) -> None:
+    images = load_training_images(load_dataset(cloth_dataset), 64, indices=np.array([1, 3]))
+    assert [i.shape for i in images.images] == [(80, 80, 3)] * 2
+    assert images.xy.shape == (2, 625, 2)
+
+
+def test_sigma_falls_to_its_final_value() -> None:
+    config = TrainConfig(steps=300, sigma_px=1.0, sigma_start_px=64.0)
+    assert [compute_sigma(config, s) for s in (0, 100, 200, 299)] == pytest.approx([64.0, 8.0, 1.0, 1.0])
+
+
+def test_sigma_never_starts_below_its_final_value() -> None:
+    config = TrainConfig(steps=300, sigma_px=16.0, sigma_start_px=4.0)
+    assert {compute_sigma(config, s) for s in (0, 100, 299)} == {16.0}
+
+
+def test_reference_schedule() -> None:
+    config = TrainConfig(schedule="step", learning_rate=1e-4)
+    assert [compute_learning_rate(config, s) for s in (0, 249, 250, 500)] == pytest.approx([1e-4, 1e-4, 9e-5, 8.1e-5])
+
+
+def test_cosine_schedule_warms_up_and_ends_at_a_hundredth() -> None:
+    config = TrainConfig(steps=1000, learning_rate=1.0)
+    rates = [compute_learning_rate(config, s) for s in range(1001)]
+    assert (rates[0], max(rates), rates[50], rates[1000]) == pytest.approx((0.02, 1.0, 1.0, 0.01), rel=0.01)
