@@ -29,7 +29,7 @@ PIP := env -u PYTHONDONTWRITEBYTECODE $(PY) -m pip --disable-pip-version-check i
 STAMP := .venv/.installed
 PAPERMILL := $(PY) -m papermill --kernel python3
 
-.PHONY: help .venv reproduce smoke test lint unit notebooks-test lab lock clean clean-all force
+.PHONY: help .venv reproduce smoke test lint unit notebooks-test readme lab lock clean clean-all force
 
 help: ## List the targets
 	@grep -hE '^[.a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | awk -F'\t' '{ printf "  make %-15s %s\n", $$1, $$2 }'
@@ -54,6 +54,9 @@ unit: $(STAMP) ## Run the tests in tests/
 notebooks-test: $(STAMP) ## Run the notebooks and compare their outputs with the committed ones
 	$(PY) -m pytest --nbval --nbval-current-env --nbval-cell-timeout=600 \
 		--nbval-sanitize-with=tests/nbval_sanitize.cfg notebooks/0*.ipynb
+
+readme: $(STAMP) ## Put the numbers of data/results/quick into the README
+	$(PY) -m mmgsd.tables data/results/quick README.md
 
 lab: $(STAMP) ## Open the notebooks in JupyterLab
 	$(PY) -m jupyterlab notebooks

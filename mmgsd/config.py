@@ -190,10 +190,10 @@ PRESETS = {
     ),
     "quick": _preset(
         "quick",
-        train_images=400, test_images=60, views=10,
-        train={"steps": 400}, rope={"input_px": 160},
-        ablation={"steps": 150}, sigmas=(1.0, 4.0, 16.0),
-        evaluate={"pairs": 60, "points": 625},
+        train_images=300, test_images=50, views=5,
+        train={"steps": 300}, rope={"input_px": 160},
+        ablation={"steps": 100}, sigmas=(1.0, 4.0, 16.0),
+        evaluate={"pairs": 50, "points": 625},
     ),
     "paper": _preset(
         "paper",

@@ -28,8 +28,8 @@ METHOD_LABELS = {
     "surf": "SURF", "akaze": "AKAZE", "daisy": "DAISY", "centre": "Object centre", "random": "Random points",
 }  # fmt: skip
 METHOD_COLOURS = {
-    "mmgsd": "#D55E00", "spcl": "#0072B2", "pcl": "#56B4E9", "unimodal": "#009E73", "sift": "#CC79A7", "orb": "#E69F00",
-    "surf": "#882255", "akaze": "#332288", "daisy": "#999933", "centre": "#404040", "random": "#9A9A9A",
+    "mmgsd": "#D55E00", "spcl": "#0072B2", "pcl": "#56B4E9", "unimodal": "#009E73", "sift": "#CC79A7", "orb": "#999933",
+    "surf": "#882255", "akaze": "#332288", "daisy": "#E69F00", "centre": "#404040", "random": "#9A9A9A",
 }  # fmt: skip
 CHANCE_STYLES = {"centre": "--", "random": ":"}
 COLUMN_IN, PAGE_IN = 3.5, 7.1  # widths of a column and of a page
@@ -73,12 +73,14 @@ def compute_point_colours(object: str, count: int = N_POINTS) -> np.ndarray:
 def show_source(axis: Axes, match: Match, index: int) -> None:
     """Source image with the pixel of one query."""
     axis.imshow(match.image0)
+    axis.autoscale(False)
     mark_pixel(axis, *match.xy[index])
 
 
 def show_answer(axis: Axes, match: Match, index: int, *, modes: bool = True) -> None:
     """Target with heatmap, and the modes with their 1-std ellipses where asked for."""
     axis.imshow(blend_heatmap(match.image1, match.heatmap[index]))
+    axis.autoscale(False)  # a wide ellipse must not shrink the image
     if not modes:
         return
     for (x, y), weight, covariance in zip(match.modes[index], match.weights[index], match.covariances[index],

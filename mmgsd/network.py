@@ -17,7 +17,7 @@ class PyramidNetwork(nn.Module):
 
     stride = 4
 
-    def __init__(self, descriptor_dim: int, *, width: int = 128, pretrained: bool = True) -> None:
+    def __init__(self, descriptor_dim: int, *, width: int = 96, pretrained: bool = True) -> None:
         super().__init__()
         self.trunk = EfficientNet.from_name("efficientnet-lite0")
         if pretrained:
@@ -29,6 +29,14 @@ class PyramidNetwork(nn.Module):
         self.context = nn.Sequential(_conv_block(width, width), _conv_block(width, width))
         self.head = nn.Conv2d(width, descriptor_dim, 1)
         _register_normalisation(self)
+
+    def train(self, mode: bool = True) -> PyramidNetwork:
+        """As usual, but the trunk keeps ImageNet's batch statistics: half the time of a backward pass on a CPU."""
+        super().train(mode)
+        for module in self.trunk.modules():
+            if isinstance(module, nn.BatchNorm2d):
+                module.eval()
+        return self
 
     def forward(self, image: Tensor) -> Tensor:
         """Dense descriptors, not normalised: their distance carries the temperature."""

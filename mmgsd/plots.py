@@ -166,8 +166,8 @@ def plot_sigma_ablation(results: Mapping[str, Mapping[str, Mapping[str, float]]]
             axis.annotate(f"{y:.1f}", (x, y), xytext=(0, 4), textcoords="offset points", ha="center", fontsize=6.5)
         axis.set_xscale("log", base=2)
         axis.set_xticks(sigma, [f"{s:g}" for s in sigma])
-        axis.set(title=name.capitalize(), xlabel="Std σ of a target mode (px)")
-        axis.margins(x=0.15, y=0.25)
+        axis.set(title=name.capitalize(), xlabel="Std σ of a target mode (px)", ylim=(0, 1.2 * max(error)))
+        axis.margins(x=0.15)
     axes[0, 0].set_ylabel("RMSE of MMGSD (px)")
     return finish_axes(figure)
 
@@ -226,6 +226,8 @@ def plot_labels(
     colours = compute_point_colours(object, len(xy))
     axes[0, 0].imshow(image)
     axes[0, 1].imshow(fade_image(image))
+    for axis in axes[0]:
+        axis.autoscale(False)
     axes[0, 1].scatter(*xy[~visible].T, s=4, facecolors="none", edgecolors=colours[~visible], linewidths=0.4)
     axes[0, 1].scatter(*xy[visible].T, s=4, c=colours[visible], linewidths=0)
     for axis in axes[0]:

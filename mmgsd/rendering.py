@@ -83,7 +83,8 @@ def render_batch(job: dict) -> bytes:
         # as many children as cores, so one thread in each
         env = {"MMGSD_THREADS": "1", "OMP_NUM_THREADS": "1", **os.environ, "PYTHONPATH": path}
         text = json.dumps({**job, "out": str(out)})
-        done = subprocess.run([sys.executable, "-m", "mmgsd.scene"], input=text, env=env, capture_output=True, text=True)
+        command = [sys.executable, "-m", "mmgsd.scene"]
+        done = subprocess.run(command, input=text, env=env, capture_output=True, text=True)
         if done.returncode or not out.is_file():
             raise RenderError(f"rendering {job['split']} {job['episodes']} failed:\n{done.stderr[-2000:]}")
         return out.read_bytes()

@@ -110,6 +110,15 @@ def test_a_ray_that_meets_nothing_leaves_its_point_visible():
     assert render.find_visible(deformed, bvh, camera).tolist() == [True]
 
 
+def test_crossings_count_a_flap_pushed_through_the_cloth():
+    vertices = cloth.flat_vertices()
+    assert cloth.count_crossings(vertices) == 0
+    grid = vertices.reshape(cloth.SIDE, cloth.SIDE, 3)
+    grid[0, 0] = grid[10, 10] + (0.3 * cloth.SPACING, 0.3 * cloth.SPACING, -0.05)  # its neighbours stay above
+    grid[0, 1, 2] = grid[1, 0, 2] = grid[1, 1, 2] = 0.05
+    assert cloth.count_crossings(vertices) > 0
+
+
 def test_unknown_split_and_state_are_named():
     with pytest.raises(ValueError, match="split must be one of train, test"):
         episode.render_episode(RenderConfig(), "tset", 0, 1)

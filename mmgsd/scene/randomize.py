@@ -104,7 +104,7 @@ def _new_lamp(rng: np.random.Generator, scene: bpy.types.Scene) -> tuple[bpy.typ
 
 def _draw_gloss(rng: np.random.Generator, chance: float) -> float:
     """No shine, or with ``chance`` a little."""
-    return rng.uniform(0.02, 0.12) if rng.random() < chance else 0.0
+    return rng.uniform(0.01, 0.06) if rng.random() < chance else 0.0
 
 
 def draw_object_material(rng: np.random.Generator, mesh: bpy.types.Object, background: Colour) -> str:
@@ -118,7 +118,7 @@ def draw_object_material(rng: np.random.Generator, mesh: bpy.types.Object, backg
         textures = CLOTH_TEXTURES if "rest" in mesh.data.attributes else OBJECT_TEXTURES
         names.append(str(rng.choice(list(textures))))
         surface = _two_faced(rng, shader, textures[names[-1]](rng, shader, colour))
-        shader.finish(surface, rng.uniform(0.3, 1.0), _draw_gloss(rng, 0.25), True)
+        shader.finish(surface, rng.uniform(0.4, 1.0), _draw_gloss(rng, 0.25), True)
     return names[0]
 
 
@@ -140,5 +140,5 @@ def draw_background(rng: np.random.Generator, floor: bpy.types.Object) -> tuple[
     place = shader.node("TexCoord").outputs["Object"]
     mapping = {"Vector": place, "Location": rng.uniform(-9, 9, 3), "Rotation": (0, 0, rng.uniform(0, 2 * np.pi))}
     place = shader.node("Mapping", mapping).outputs[0]
-    shader.finish(BACKGROUNDS[name](rng, shader, colour, place), rng.uniform(0.25, 1.0), _draw_gloss(rng, 0.3), False)
+    shader.finish(BACKGROUNDS[name](rng, shader, colour, place), rng.uniform(0.4, 1.0), _draw_gloss(rng, 0.3), False)
     return colour, name

@@ -96,7 +96,7 @@ def add_mesh(name: str, vertices: np.ndarray, faces: np.ndarray) -> bpy.types.Ob
 
 
 def setup_cycles(scene: bpy.types.Scene, size: tuple[int, int], samples: int) -> None:
-    """Few samples, two bounces, linear colours without tone mapping beyond the display's curve."""
+    """Few samples of direct light, saved as linear colours beside the object's mask."""
     scene.render.engine = "CYCLES"
     scene.render.resolution_x, scene.render.resolution_y = size
     scene.render.use_persistent_data = True  # the views of an episode share the object and its BVH
@@ -106,7 +106,8 @@ def setup_cycles(scene: bpy.types.Scene, size: tuple[int, int], samples: int) ->
     cycles = scene.cycles
     cycles.samples, cycles.use_adaptive_sampling, cycles.use_denoising = samples, False, False
     cycles.use_light_tree, cycles.sampling_pattern = False, "TABULATED_SOBOL"  # the defaults cost a third more
-    cycles.max_bounces, cycles.diffuse_bounces, cycles.glossy_bounces = 1, 1, 1
+    cycles.pixel_filter_type = "BOX"  # the mask is then the share of the pixel's own square
+    cycles.max_bounces = cycles.diffuse_bounces = cycles.glossy_bounces = 0  # sky and lamp reach every fold directly
     cycles.transmission_bounces = cycles.volume_bounces = cycles.transparent_max_bounces = 0
     cycles.caustics_reflective = cycles.caustics_refractive = False
     cycles.device = "GPU" if _enable_gpu() else "CPU"
