@@ -1,9 +1,43 @@
-"""Geometric and photometric augmentation: labels move as the pixels do."""
+"""Training images in memory, and augmented batches of them: labels move as the pixels do."""
 
 from __future__ import annotations
 
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
+import torch
+from torch import Tensor
+
+from mmgsd.config import TrainConfig
+from mmgsd.dataset import Dataset
+from mmgsd.network import compute_input_size
+
+CACHE_SCALE = 1.25  # images are kept in memory at this multiple of the network's input size
+
+
+@dataclass(frozen=True)
+class TrainingImages:
+    """A data set's images in memory at about the network's resolution, labels in full-image px."""
+
+    images: list[np.ndarray]  # N of (h, w, 3) uint8
+    masks: list[np.ndarray]  # N of (h, w) uint8, 255 on the object
+    xy: np.ndarray  # (N, P, 2) px
+    visible: np.ndarray  # (N, P) bool
+    size: tuple[int, int]  # full (W, H) px
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Augmented images as tensors."""
+
+    image: Tensor  # (B, 3, h, w) in [0, 1]
+    mask: Tensor  # (B, h, w) bool
+    xy: Tensor  # (B, P, 2) full-image px
+    askable: Tensor  # (B, P) bool, points visible and inside
+    inside: Tensor  # (B, P) bool
 
 
 def sample_affine(
@@ -58,3 +92,38 @@ def jitter_colours(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         noise = rng.normal(0, rng.uniform(0, 10), image.shape)
         image = (image + noise).clip(0, 255).astype(np.uint8)
     return image
+
+
+def load_training_images(data: Dataset, input_px: int, *, indices: np.ndarray | None = None) -> TrainingImages:
+    """Read images and masks once, reduced to a little more than the network's input size."""
+    indices = np.arange(len(data)) if indices is None else indices
+    width, height = (round(s * CACHE_SCALE) for s in compute_input_size(data.size, input_px))
+
+    def load(index: int) -> tuple[np.ndarray, np.ndarray]:
+        image, mask = data.load_image(index), data.load_mask(index).astype(np.uint8) * 255
+        return tuple(cv2.resize(a, (width, height), interpolation=cv2.INTER_AREA) for a in (image, mask))
+
+    with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
+        images, masks = zip(*pool.map(load, indices), strict=True)
+    return TrainingImages(list(images), list(masks), data.xy[indices], data.visible[indices], data.size)
+
+
+def make_batch(
+    images: TrainingImages, indices: np.ndarray, config: TrainConfig, rng: np.random.Generator, device: torch.device
+) -> Batch:
+    """Augment the images ``indices`` (B,), labels with them, and move them to the device."""
+    size = compute_input_size(images.size, config.input_px)
+    identity = np.eye(2, 3)
+    pixels, masks, points = [], [], []
+    for index in indices:
+        affine = sample_affine(images.size, rng, rotate=config.rotate) if config.augment else identity
+        image = warp_image(images.images[index], affine, images.size, size)
+        pixels.append(jitter_colours(image, rng) if config.augment else image)
+        masks.append(warp_image(images.masks[index], affine, images.size, size) > 127)
+        points.append(warp_points(images.xy[index], affine))
+    xy = np.stack(points)
+    inside = np.all((xy > -0.5) & (xy < np.array(images.size) - 0.5), axis=-1)
+    image = torch.from_numpy(np.stack(pixels)).to(device).permute(0, 3, 1, 2).float() / 255
+    tensors = (torch.from_numpy(a).to(device) for a in (np.stack(masks), xy.astype(np.float32)))
+    askable = torch.from_numpy(inside & images.visible[indices]).to(device)
+    return Batch(image, *tensors, askable, torch.from_numpy(inside).to(device))

@@ -78,7 +78,6 @@ class RenderConfig:
         return IMAGE_SIZE[self.object]
 
 
-
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TrainConfig:
     """How one model is trained. Pixels are those of the full image, whatever the network's input size."""

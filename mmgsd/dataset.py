@@ -1,12 +1,13 @@
 """The data set on disk: its format, its checker and reader, and how pairs of images are drawn from it.
 
-    dataset.json      object, image size, symmetry groups, seed, versions, number of images of each split
-    labels.parquet    one row an image: file, mask, split, episode, view, xy, visible, intrinsics, camera_pose, state …
-    images/*.webp     lossless colour images          masks/*.png    1-bit object masks
+dataset.json      object, image size, symmetry groups, seed, versions, number of images of each split
+labels.parquet    one row an image: file, mask, split, episode, view, xy, visible, intrinsics, camera_pose, state …
+images/*.webp     lossless colour images          masks/*.png    1-bit object masks
 """
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 from dataclasses import dataclass
@@ -69,6 +70,12 @@ class Dataset:
     def episode(self) -> np.ndarray:
         """(N,) int, the simulation that each image shows."""
         return self.labels.episode.to_numpy()
+
+    @property
+    def fingerprint(self) -> str:
+        """Sixteen hexadecimal digits of what was rendered and with which versions."""
+        text = json.dumps([self.info["config"], self.info["versions"]], sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def group(self, name: str = "") -> SymmetryGroup:
         """The stored symmetry group of that name ("" is the object's own); ValueError names those stored."""

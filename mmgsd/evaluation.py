@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 from collections.abc import Callable, Iterator
@@ -14,7 +15,7 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from mmgsd.baselines import compute_baseline_heatmap
-from mmgsd.config import N_POINTS, EvaluateConfig
+from mmgsd.config import N_POINTS, EvaluateConfig, digest
 from mmgsd.dataset import Dataset, load_dataset, sample_pairs
 from mmgsd.matching import Matcher, compute_entropy, fit_modes
 from mmgsd.metrics import aggregate, compute_query_errors
@@ -32,14 +33,18 @@ def evaluate_model(
     weights: Path, dataset: Path, config: EvaluateConfig, out: Path, *,
     group: str = "", overwrite: bool = False, progress: bool = True,
 ) -> Path:  # fmt: skip
-    """Ask a trained model all queries and write the table ``out`` (Parquet); a finished one is returned as it is.
+    """Ask a trained model all queries and write the table ``out`` (Parquet).
+
+    A table of the same weights, data set and configuration is returned as it is.
 
     The true matches are those of ``group`` ("" is the object's own), whatever the model was taught.
     """
-    if out.is_file() and not overwrite:
+    data = load_dataset(dataset, "test")
+    question = _describe_question(data, config, group, hashlib.sha256(Path(weights).read_bytes()).hexdigest())
+    if _is_answered(out, question) and not overwrite:
         return out
-    matcher, data = Matcher.load(weights), load_dataset(dataset, "test")
-    return _write(_ask(_model_answer(matcher, data), data, config, group, progress, out.stem), out)
+    answer = _model_answer(Matcher.load(weights), data)
+    return _write(_ask(answer, data, config, group, progress, out.stem), out, question)
 
 
 def evaluate_baseline(
@@ -49,11 +54,12 @@ def evaluate_baseline(
     """Ask ``sift``, ``orb``, or chance (``centre``, ``random``) the same queries; ValueError for another method."""
     if method not in BASELINES + CHANCE:
         raise ValueError(f"method must be one of {BASELINES + CHANCE}, got {method!r}")
-    if out.is_file() and not overwrite:
-        return out
     data = load_dataset(dataset, "test")
+    question = _describe_question(data, config, group, method)
+    if _is_answered(out, question) and not overwrite:
+        return out
     answer = _chance_answer(method, data) if method in CHANCE else _classical_answer(method, data)
-    return _write(_ask(answer, data, config, group, progress, out.stem), out)
+    return _write(_ask(answer, data, config, group, progress, out.stem), out, question)
 
 
 def load_queries(path: Path) -> pd.DataFrame:
@@ -177,9 +183,19 @@ def _describe_batches(matcher: Matcher, data: Dataset, indices: np.ndarray, batc
         yield from zip(chosen.tolist(), matcher.describe([data.load_image(i) for i in chosen]), strict=True)
 
 
-def _write(table: pd.DataFrame, out: Path) -> Path:
+def _describe_question(data: Dataset, config: EvaluateConfig, group: str, method: str) -> dict[str, str]:
+    """What a table of answers depends on; kept in it, so that a stale one is noticed."""
+    return {"data": data.fingerprint, "config": digest(config), "group": data.group(group).name, "method": method}
+
+
+def _is_answered(out: Path, question: dict[str, str]) -> bool:
+    return out.is_file() and load_queries(out).attrs == question
+
+
+def _write(table: pd.DataFrame, out: Path, question: dict[str, str]) -> Path:
     out.parent.mkdir(parents=True, exist_ok=True)
     aside = out.with_suffix(".tmp")
+    table.attrs = question
     table.to_parquet(aside, index=False)
     os.replace(aside, out)
     return out

@@ -224,9 +224,7 @@ class Matcher:
         return compute_heatmap(squared, bandwidth=self.bandwidth).view(len(xy), *descriptors1.shape[1:])
 
     @torch.inference_mode()
-    def match(
-        self, image0: np.ndarray, image1: np.ndarray, xy: np.ndarray | list, *, n: int | None = None
-    ) -> Match:
+    def match(self, image0: np.ndarray, image1: np.ndarray, xy: np.ndarray | list, *, n: int | None = None) -> Match:
         """All matches in ``image1`` of the pixels ``xy`` (S, 2) of ``image0``.
 
         Images are (H, W, 3), (H, W, 4) or (H, W), uint8 or float in [0, 1]. ``n`` modes are fitted, by default as many

@@ -8,14 +8,12 @@ import math
 import os
 import shutil
 import time
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pandas as pd
 import torch
+from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 from torch.nn import functional as F
@@ -23,7 +21,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from tqdm.auto import tqdm
 
 from mmgsd import losses
-from mmgsd.augmentation import jitter_colours, sample_affine, warp_image, warp_points
+from mmgsd.augmentation import Batch, load_training_images, make_batch
 from mmgsd.config import TrainConfig
 from mmgsd.dataset import Dataset, load_dataset
 from mmgsd.evaluation import calibrate_bandwidth
@@ -32,36 +30,12 @@ from mmgsd.matching import Matcher
 from mmgsd.network import (
     build_network,
     compute_cell_centres,
-    compute_input_size,
     find_device,
     sample_descriptors,
 )
 
 WEIGHTS, CHECKPOINT, LOG = "weights.safetensors", "checkpoint.pt", "log.csv"
 CHECKPOINT_SECONDS = 60.0  # of training between two checkpoints
-CACHE_SCALE = 1.25  # images are kept in memory at this multiple of the network's input size
-
-
-@dataclass(frozen=True)
-class TrainingImages:
-    """A data set's images in memory at about the network's resolution, labels in full-image px."""
-
-    images: list[np.ndarray]  # N of (h, w, 3) uint8
-    masks: list[np.ndarray]  # N of (h, w) uint8, 255 on the object
-    xy: np.ndarray  # (N, P, 2) px
-    visible: np.ndarray  # (N, P) bool
-    size: tuple[int, int]  # full (W, H) px
-
-
-@dataclass(frozen=True)
-class Batch:
-    """Augmented images as tensors."""
-
-    image: Tensor  # (B, 3, h, w) in [0, 1]
-    mask: Tensor  # (B, h, w) bool
-    xy: Tensor  # (B, P, 2) full-image px
-    askable: Tensor  # (B, P) bool, points visible and inside
-    inside: Tensor  # (B, P) bool
 
 
 def compute_sigma(config: TrainConfig, step: int) -> float:
@@ -90,11 +64,13 @@ def train_model(
     Raises ValueError where the data set is of another object or does not store the symmetry group.
     """
     weights = folder / WEIGHTS
+    data = load_dataset(dataset, "train")
     if weights.is_file() and not overwrite:
+        if load_metadata(weights).get("data") != data.fingerprint:
+            raise ValueError(f"{weights} was trained on another data set than {dataset}: use overwrite=True")
         return weights
     if overwrite and folder.exists():
         shutil.rmtree(folder)
-    data = load_dataset(dataset, "train")
     if data.object != config.object:
         raise ValueError(f"object is {config.object!r}, but {dataset} shows a {data.object}")
     run = _Run(config, data, folder, torch.device(device or find_device()))
@@ -103,41 +79,6 @@ def train_model(
     for _ in bar:
         bar.set_postfix(loss=f"{run.advance():.3f}", refresh=False)
     return run.finish(weights)
-
-
-def load_training_images(data: Dataset, input_px: int, *, indices: np.ndarray | None = None) -> TrainingImages:
-    """Read images and masks once, reduced to a little more than the network's input size."""
-    indices = np.arange(len(data)) if indices is None else indices
-    width, height = (round(s * CACHE_SCALE) for s in compute_input_size(data.size, input_px))
-
-    def load(index: int) -> tuple[np.ndarray, np.ndarray]:
-        image, mask = data.load_image(index), data.load_mask(index).astype(np.uint8) * 255
-        return tuple(cv2.resize(a, (width, height), interpolation=cv2.INTER_AREA) for a in (image, mask))
-
-    with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
-        images, masks = zip(*pool.map(load, indices), strict=True)
-    return TrainingImages(list(images), list(masks), data.xy[indices], data.visible[indices], data.size)
-
-
-def make_batch(
-    images: TrainingImages, indices: np.ndarray, config: TrainConfig, rng: np.random.Generator, device: torch.device
-) -> Batch:
-    """Augment the images ``indices`` (B,), labels with them, and move them to the device."""
-    size = compute_input_size(images.size, config.input_px)
-    identity = np.eye(2, 3)
-    pixels, masks, points = [], [], []
-    for index in indices:
-        affine = sample_affine(images.size, rng, rotate=config.rotate) if config.augment else identity
-        image = warp_image(images.images[index], affine, images.size, size)
-        pixels.append(jitter_colours(image, rng) if config.augment else image)
-        masks.append(warp_image(images.masks[index], affine, images.size, size) > 127)
-        points.append(warp_points(images.xy[index], affine))
-    xy = np.stack(points)
-    inside = np.all((xy > -0.5) & (xy < np.array(images.size) - 0.5), axis=-1)
-    image = torch.from_numpy(np.stack(pixels)).to(device).permute(0, 3, 1, 2).float() / 255
-    tensors = (torch.from_numpy(a).to(device) for a in (np.stack(masks), xy.astype(np.float32)))
-    askable = torch.from_numpy(inside & images.visible[indices]).to(device)
-    return Batch(image, *tensors, askable, torch.from_numpy(inside).to(device))
 
 
 def compute_loss(
@@ -253,8 +194,10 @@ class _Run:
             "config": json.dumps(dataclasses.asdict(self.config)),
             "size": json.dumps(self.size),
             "modes": str(modes),
+            "data": self.data.fingerprint,
+            "images": str(len(self.data)),
             "seconds": f"{self.seconds:.1f}",
-            "device": self.device.type,
+            "hardware": _name_hardware(self.device),
         }
         if self.config.method in CONTRASTIVE:
             matcher = Matcher(self.average.module, self.config, modes=modes, size=self.size, device=self.device.type)
@@ -265,6 +208,18 @@ class _Run:
         os.replace(aside, weights)
         (self.folder / CHECKPOINT).unlink(missing_ok=True)
         return weights
+
+
+def load_metadata(weights: Path | str) -> dict[str, str]:
+    """What a weights file says of itself: ``config``, ``seconds`` of training, ``hardware``, ``images``, …"""
+    with safe_open(weights, "pt") as file:
+        return file.metadata() or {}
+
+
+def _name_hardware(device: torch.device) -> str:
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    return f"CPU, {os.cpu_count()} cores"
 
 
 def _cosine(progress: float) -> float:
