@@ -97,6 +97,7 @@ class TrainConfig:
     weight_decay: float = 0.02
     sigma_px: float = 1.0  # std of a target mode at the end of training
     sigma_start_px: float = 48.0  # std at its start; annealed geometrically over the first two thirds
+    prototype_weight: float = 1.0  # of the dense supervision by single images (unimodal and mmgsd); 0: pairs only
     margin: float = 0.5  # contrastive losses only
     non_matches: int = 150  # a match, half of them on the object (contrastive losses only)
     augment: bool = True
@@ -190,9 +191,9 @@ PRESETS = {
     "quick": _preset(
         "quick",
         train_images=300, test_images=50, views=5,
-        train={"steps": 300}, rope={"input_px": 160},
-        ablation={"steps": 100}, sigmas=(1.0, 4.0, 16.0),
-        evaluate={"pairs": 50, "points": 625},
+        train={"steps": 340, "input_px": 96, "pairs": 40, "queries": 32}, rope={"input_px": 128},
+        ablation={"steps": 120}, sigmas=(1.0, 4.0, 16.0),
+        evaluate={"pairs": 30, "points": 625},
     ),
     "paper": _preset(
         "paper",

@@ -33,8 +33,10 @@ from mmgsd.network import (
     find_device,
     sample_descriptors,
 )
+from mmgsd.prototypes import compute_prototype_loss, make_prototypes
 
 WEIGHTS, CHECKPOINT, LOG = "weights.safetensors", "checkpoint.pt", "log.csv"
+PROTOTYPE_EVERY = 4  # each step asks every so many material points
 CHECKPOINT_SECONDS = 60.0  # of training between two checkpoints
 
 
@@ -125,9 +127,10 @@ class _Run:
         # the average of the last steps' weights, statistics of batch normalisation included, is what is kept
         average = get_ema_multi_avg_fn(1 - 1 / max(2.0, config.steps / 50))
         self.average = AveragedModel(self.network, multi_avg_fn=average, use_buffers=True)
-        self.optimiser = torch.optim.AdamW(
-            self.network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
-        )
+        start = make_prototypes(data.xy, group.permutations, config.descriptor_dim, math.hypot(*data.size))
+        self.prototypes = torch.nn.Parameter(start.to(device))
+        parameters = [*self.network.parameters(), self.prototypes]
+        self.optimiser = torch.optim.AdamW(parameters, lr=config.learning_rate, weight_decay=config.weight_decay)
         self.step, self.seconds, self.saved_at, self.log = 0, 0.0, 0.0, []
 
     def advance(self) -> float:
@@ -142,6 +145,8 @@ class _Run:
         self.network.train()
         descriptors = self.network(batch.image.contiguous(memory_format=torch.channels_last))
         loss = compute_loss(self.config, descriptors, batch, self.permutations, self.size, self.step)
+        if self.config.prototype_weight and self.config.method not in CONTRASTIVE:
+            loss = loss + self.config.prototype_weight * self.compute_dense_loss(descriptors, batch)
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), 5.0)
@@ -154,6 +159,14 @@ class _Run:
             self.save()
         return loss.item()
 
+    def compute_dense_loss(self, descriptors: Tensor, batch: Batch) -> Tensor:
+        """The prototypes' loss, on a part of the material points in turn."""
+        turn = torch.arange(batch.askable.shape[1], device=self.device) % PROTOTYPE_EVERY
+        asked = batch.askable & (turn == self.step % PROTOTYPE_EVERY)
+        permutations = self.permutations[:1] if self.config.method in MATCHES_OF_ONE else self.permutations
+        sampled = sample_descriptors(descriptors, batch.xy, self.size)
+        return compute_prototype_loss(sampled, asked, self.prototypes, permutations)
+
     def save(self) -> None:
         """Write a checkpoint aside, then rename it."""
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -161,6 +174,7 @@ class _Run:
             "config": json.dumps(dataclasses.asdict(self.config)),
             "network": self.network.state_dict(),
             "average": self.average.state_dict(),
+            "prototypes": self.prototypes.detach(),
             "optimiser": self.optimiser.state_dict(),
             "step": self.step,
             "seconds": self.seconds,
@@ -181,6 +195,7 @@ class _Run:
             raise ValueError(f"{path} belongs to another configuration: choose another folder or overwrite=True")
         for name in ("network", "average", "optimiser"):
             getattr(self, name).load_state_dict(state[name])
+        self.prototypes.data.copy_(state["prototypes"])
         self.step, self.seconds, self.log = state["step"], state["seconds"], state["log"]
         self.saved_at = self.seconds
 

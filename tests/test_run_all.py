@@ -1,4 +1,4 @@
-"""The whole experiment through papermill, as a user runs it: from another folder, interrupted, and with a wrong preset."""
+"""The whole experiment through papermill, as a user runs it: from another folder, and with a wrong preset."""
 
 import subprocess
 import sys
