@@ -1,0 +1,80 @@
+"""The rendering stage: planned by configuration alone, resumed after a kill, never mixed with another configuration."""
+
+import dataclasses
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from mmgsd import rendering
+from mmgsd.config import RenderConfig
+from mmgsd.dataset import check_dataset
+from mmgsd.rendering import RenderError, plan_batches, render_batch, render_dataset
+
+CONFIG = RenderConfig(object="rope", train_images=3, test_images=2, views=1, samples=1, seed=5)
+SCRIPT = """
+import sys
+from pathlib import Path
+from mmgsd import rendering
+from mmgsd.config import RenderConfig
+if __name__ == "__main__":
+    rendering.EPISODES_A_BATCH = 1
+    config = RenderConfig(object="rope", train_images=3, test_images=2, views=1, samples=1, seed=5)
+    rendering.render_dataset(config, Path(sys.argv[1]), workers=int(sys.argv[2]), progress=False)
+"""
+
+
+def start(folder: Path, workers: int) -> subprocess.Popen:
+    script = folder.parent / "render.py"
+    script.write_text(SCRIPT)
+    path = str(Path(rendering.__file__).resolve().parents[1])
+    env = {**os.environ, "PYTHONPATH": path}
+    return subprocess.Popen([sys.executable, str(script), str(folder), str(workers)], env=env, start_new_session=True)
+
+
+def read_tree(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def test_every_image_is_planned_once_and_splits_share_no_simulation() -> None:
+    config = RenderConfig(train_images=93, test_images=21, views=10)
+    jobs = plan_batches(config)
+    for split, images in (("train", 93), ("test", 21)):
+        episodes = [e for job in jobs.values() if job["split"] == split for e in job["episodes"]]
+        assert sum(n for _, n in episodes) == images
+        assert [e for e, _ in episodes] == list(range(len(episodes)))
+
+
+def test_a_killed_rendering_goes_on_and_ends_with_the_same_bytes(tmp_path: Path) -> None:
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    assert start(whole, 2).wait(300) == 0
+    process = start(killed, 1)
+    partial = tmp_path / "killed.partial"
+    deadline = time.monotonic() + 120
+    while not list(partial.glob("*.zip")) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    kept = {path.name: path.stat().st_mtime_ns for path in partial.glob("*.zip")}
+    assert kept and not killed.exists()
+    assert start(killed, 1).wait(300) == 0
+    assert read_tree(whole) == read_tree(killed)
+    assert check_dataset(killed).images.to_list() == [3, 2]
+    with pytest.raises(ValueError, match="seed: 5 there, 6 asked for"):
+        render_dataset(dataclasses.replace(CONFIG, seed=6), killed)
+
+
+def test_a_folder_begun_with_another_configuration_is_not_mixed(tmp_path: Path) -> None:
+    rendering._claim(CONFIG, tmp_path)
+    with pytest.raises(ValueError, match="samples: 1 there, 2 asked for"):
+        rendering._claim(dataclasses.replace(CONFIG, samples=2), tmp_path)
+
+
+def test_a_failing_child_says_why() -> None:
+    job = next(iter(plan_batches(CONFIG).values()))
+    with pytest.raises(RenderError, match="split must be one of"):
+        render_batch({**job, "split": "validation"})
