@@ -88,13 +88,11 @@ def compute_loss(
 ) -> Tensor:
     """The configured method's loss of a batch: every image is a source and a target of others.
 
-    ``descriptors`` (B, D, h, w), ``permutations`` (G, P) of the symmetry group. Randomness comes from seed and step.
+    ``descriptors`` (B, D, h, w), ``permutations`` (G, P) of the matches the method knows. Randomness comes from seed and step.
     """
     generator = torch.Generator(descriptors.device).manual_seed(config.seed * 1_000_003 + step)
     pair = _sample_batch_pairs(len(descriptors), config.pairs, generator, descriptors.device)  # (2, K)
     points = torch.multinomial(batch.askable[pair[0]].float() + 1e-9, config.queries, True, generator=generator)
-    if config.method in MATCHES_OF_ONE:
-        permutations = permutations[:1]
     orbit = permutations[:, points].permute(1, 2, 0)  # (K, Q, G)
     sampled = sample_descriptors(descriptors, batch.xy, size)  # (B, P, D)
     source = sampled[pair[0][:, None], points]  # (K, Q, D)
@@ -119,7 +117,8 @@ class _Run:
         self.config, self.data, self.folder = config, data, folder
         self.device, self.size = device, data.size
         group = data.group(config.group)
-        self.permutations = torch.tensor(group.permutations, device=device)
+        known = group.permutations[:1] if config.method in MATCHES_OF_ONE else group.permutations
+        self.permutations = torch.tensor(known, device=device)
         self.images = load_training_images(data, config.input_px)
         torch.manual_seed(config.seed)
         network = build_network(config.network, config.descriptor_dim).to(device)
@@ -127,7 +126,7 @@ class _Run:
         # the average of the last steps' weights, statistics of batch normalisation included, is what is kept
         average = get_ema_multi_avg_fn(1 - 1 / max(2.0, config.steps / 50))
         self.average = AveragedModel(self.network, multi_avg_fn=average, use_buffers=True)
-        start = make_prototypes(data.xy, group.permutations, config.descriptor_dim, math.hypot(*data.size))
+        start = make_prototypes(data.xy, known, config.descriptor_dim, math.hypot(*data.size))
         self.prototypes = torch.nn.Parameter(start.to(device))
         parameters = [*self.network.parameters(), self.prototypes]
         self.optimiser = torch.optim.AdamW(parameters, lr=config.learning_rate, weight_decay=config.weight_decay)
@@ -163,9 +162,8 @@ class _Run:
         """The prototypes' loss, on a part of the material points in turn."""
         turn = torch.arange(batch.askable.shape[1], device=self.device) % PROTOTYPE_EVERY
         asked = batch.askable & (turn == self.step % PROTOTYPE_EVERY)
-        permutations = self.permutations[:1] if self.config.method in MATCHES_OF_ONE else self.permutations
         sampled = sample_descriptors(descriptors, batch.xy, self.size)
-        return compute_prototype_loss(sampled, asked, self.prototypes, permutations)
+        return compute_prototype_loss(sampled, asked, self.prototypes, self.permutations)
 
     def save(self) -> None:
         """Write a checkpoint aside, then rename it."""
@@ -203,7 +201,7 @@ class _Run:
         """Write log and weights, the weights last: a folder that has them is finished."""
         self.folder.mkdir(parents=True, exist_ok=True)
         pd.DataFrame(self.log).to_csv(self.folder / LOG, index=False)
-        modes = 1 if self.config.method in MATCHES_OF_ONE else len(self.permutations)
+        modes = len(self.permutations)
         metadata = {
             "format": "mmgsd-1",
             "config": json.dumps(dataclasses.asdict(self.config)),
