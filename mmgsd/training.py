@@ -88,7 +88,8 @@ def compute_loss(
 ) -> Tensor:
     """The configured method's loss of a batch: every image is a source and a target of others.
 
-    ``descriptors`` (B, D, h, w), ``permutations`` (G, P) of the matches the method knows. Randomness comes from seed and step.
+    ``descriptors`` (B, D, h, w), ``permutations`` (G, P) of the matches the method knows. Randomness comes from seed
+    and step.
     """
     generator = torch.Generator(descriptors.device).manual_seed(config.seed * 1_000_003 + step)
     pair = _sample_batch_pairs(len(descriptors), config.pairs, generator, descriptors.device)  # (2, K)
