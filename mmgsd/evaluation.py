@@ -189,7 +189,10 @@ def _describe_question(data: Dataset, config: EvaluateConfig, group: str, method
 
 
 def _is_answered(out: Path, question: dict[str, str]) -> bool:
-    return out.is_file() and load_queries(out).attrs == question
+    try:
+        return out.is_file() and load_queries(out).attrs == question
+    except (OSError, ValueError):  # truncated or no Parquet: pyarrow's errors are among these
+        return False
 
 
 def _write(table: pd.DataFrame, out: Path, question: dict[str, str]) -> Path:

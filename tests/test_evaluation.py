@@ -35,6 +35,13 @@ def ask_baseline(method: str, dataset: Path, out: Path, config: EvaluateConfig =
     return load_queries(evaluate_baseline(method, dataset, config, out, progress=False))
 
 
+def write_weights(folder: Path, content: bytes = b"weights") -> Path:
+    """A file that stands for trained weights: the evaluation reads its bytes to know it again."""
+    path = folder / "weights.safetensors"
+    path.write_bytes(content)
+    return path
+
+
 def answer_with_the_truth(group: str, shift: float) -> object:
     """Stands for a model that knows the labels: the true modes, moved by ``shift`` px along x."""
 
@@ -56,7 +63,9 @@ def ask_oracle(monkeypatch: pytest.MonkeyPatch, cloth_dataset: Path, tmp_path: P
         monkeypatch.setattr(evaluation.Matcher, "load", lambda path: None)
         monkeypatch.setattr(evaluation, "_model_answer", answer_with_the_truth(group, shift))
         out = tmp_path / f"oracle{group}.parquet"
-        return load_queries(evaluate_model(Path(), cloth_dataset, CONFIG, out, group=group, progress=False))
+        return load_queries(
+            evaluate_model(write_weights(tmp_path), cloth_dataset, CONFIG, out, group=group, progress=False)
+        )
 
     return ask
 
@@ -122,12 +131,32 @@ def test_unknown_baseline(cloth_dataset: Path, tmp_path: Path) -> None:
         ask_baseline("hog", cloth_dataset, tmp_path / "hog.parquet")
 
 
-def test_a_finished_table_is_left_alone(tmp_path: Path) -> None:
-    out = tmp_path / "done.parquet"
-    out.write_bytes(b"finished")
-    assert evaluate_baseline("centre", tmp_path / "no data set", CONFIG, out) == out
-    assert evaluate_model(tmp_path / "no weights", tmp_path / "no data set", CONFIG, out) == out
-    assert out.read_bytes() == b"finished"
+def test_a_finished_table_is_left_alone(cloth_dataset: Path, tmp_path: Path) -> None:
+    out = tmp_path / "centre.parquet"
+    ask_baseline("centre", cloth_dataset, out)
+    before = out.stat().st_mtime_ns
+    ask_baseline("centre", cloth_dataset, out)
+    assert out.stat().st_mtime_ns == before
+
+
+def test_a_table_of_other_questions_is_asked_again(cloth_dataset: Path, tmp_path: Path) -> None:
+    out = tmp_path / "centre.parquet"
+    assert len(ask_baseline("centre", cloth_dataset, out)) == 15
+    assert len(ask_baseline("centre", cloth_dataset, out, EvaluateConfig(pairs=1, points=5))) == 5
+
+
+def test_a_damaged_table_is_asked_again(cloth_dataset: Path, tmp_path: Path) -> None:
+    out = tmp_path / "centre.parquet"
+    out.write_bytes(b"truncated")
+    assert len(ask_baseline("centre", cloth_dataset, out)) == 15
+
+
+def test_other_weights_are_asked_again(ask_oracle: object, cloth_dataset: Path, tmp_path: Path) -> None:
+    out = tmp_path / "oracle.parquet"
+    ask_oracle()
+    kept = evaluation._is_answered(out, load_queries(out).attrs)
+    other = evaluation._describe_question(load_dataset(cloth_dataset, "test"), CONFIG, "", "another digest")
+    assert kept and not evaluation._is_answered(out, other)
 
 
 def test_overwrite_asks_again(cloth_dataset: Path, tmp_path: Path) -> None:
@@ -179,7 +208,9 @@ def test_a_model_answers_every_query(cloth_dataset: Path, tmp_path: Path, monkey
     matcher = Matcher(build_network("lite0", 4, pretrained=False), config, modes=4, size=(485, 485), device="cpu")
     monkeypatch.setattr(evaluation.Matcher, "load", lambda path: matcher)
     queries = load_queries(
-        evaluate_model(Path(), cloth_dataset, CONFIG, tmp_path / "mmgsd.parquet", group="d4", progress=False)
+        evaluate_model(
+            write_weights(tmp_path), cloth_dataset, CONFIG, tmp_path / "mmgsd.parquet", group="d4", progress=False
+        )
     )
     assert np.isfinite(queries.rmse_px).all()
     assert queries[queries["pair"] == 0].n.tolist() == [4, 4, 1, 4, 4]  # points of a diagonal under d4

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -89,8 +90,18 @@ def test_every_method_trains(cloth_dataset: Path, tmp_path: Path, method: str) -
 def test_a_finished_model_is_returned_as_it_is(cloth_dataset: Path, tmp_path: Path) -> None:
     weights = train(ONE_STEP, cloth_dataset, tmp_path)
     before = weights.stat().st_mtime_ns
-    assert train(ONE_STEP, tmp_path / "no data set is opened", tmp_path) == weights
+    assert train(ONE_STEP, cloth_dataset, tmp_path) == weights
     assert weights.stat().st_mtime_ns == before
+
+
+def test_a_model_of_another_data_set_is_not_taken_for_this_one(cloth_dataset: Path, tmp_path: Path) -> None:
+    train(ONE_STEP, cloth_dataset, tmp_path / "model")
+    other = shutil.copytree(cloth_dataset, tmp_path / "other")
+    info = json.loads((other / "dataset.json").read_text())
+    info["config"] = {"seed": 99}
+    (other / "dataset.json").write_text(json.dumps(info))
+    with pytest.raises(ValueError, match="was trained on another data set"):
+        train(ONE_STEP, other, tmp_path / "model")
 
 
 def test_overwrite_trains_again_to_the_same_weights(cloth_dataset: Path, tmp_path: Path) -> None:
