@@ -58,7 +58,7 @@ class RenderConfig:
     train_images: int = 60
     test_images: int = 20
     views: int = 10  # images of one simulation, each with its own camera, light and material
-    samples: int = 4  # Cycles samples a pixel
+    samples: int = 1  # Cycles samples a pixel, denoised
     rotation_deg: float = 180.0  # the object is turned by an angle from ± this; 45 is prior work's fix (cloth)
     ball: bool = False  # a ball at the rope's first end: prior work's way to break its symmetry
     seed: int = 0
@@ -86,6 +86,7 @@ class TrainConfig:
     method: str = "mmgsd"
     group: str = ""  # symmetry group the matches come from; "" is the object's own (c4 or c2)
     network: str = "lite0"  # or "resnet34", the contrastive papers' reference
+    trunk_weights: str = ""  # safetensors file of ImageNet weights for resnet34, torchvision's names; "": random
     descriptor_dim: int = 32
     input_px: int = 128  # the longer side of the network's input
     steps: int = 600
@@ -110,6 +111,8 @@ class TrainConfig:
         _check_choice("method", self.method, METHODS)
         _check_choice("network", self.network, ("lite0", "resnet34"))
         _check_choice("schedule", self.schedule, ("cosine", "step"))
+        accepted = "'' for lite0, which brings its own"
+        _check("trunk_weights", self.trunk_weights, accepted, not self.trunk_weights or self.network == "resnet34")
         _set_frozen(self, "group", self.group or DEFAULT_GROUP[self.object])
         for name in ("descriptor_dim", "steps", "pairs", "queries"):
             _check(name, getattr(self, name), "at least 1", getattr(self, name) >= 1)

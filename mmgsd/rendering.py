@@ -27,7 +27,7 @@ from mmgsd.config import DEFAULT_GROUP, RenderConfig
 from mmgsd.dataset import FORMAT, SPLITS, load_dataset
 from mmgsd.symmetry import GRID_GROUPS, LINE_GROUPS, load_group
 
-EPISODES_A_BATCH = 4  # a child process ends after so many, which bounds its memory
+IMAGES_A_BATCH = 30  # a child process ends after about so many, which bounds its memory
 GROUPS = {"cloth": GRID_GROUPS, "rope": LINE_GROUPS}
 
 
@@ -68,8 +68,9 @@ def plan_batches(config: RenderConfig) -> dict[str, dict]:
     jobs = {}
     for split, images in zip(SPLITS, (config.train_images, config.test_images), strict=True):
         views = [min(config.views, images - start) for start in range(0, images, config.views)]
-        for start in range(0, len(views), EPISODES_A_BATCH):
-            episodes = [[start + i, n] for i, n in enumerate(views[start : start + EPISODES_A_BATCH])]
+        batch = max(1, IMAGES_A_BATCH // config.views)
+        for start in range(0, len(views), batch):
+            episodes = [[start + i, n] for i, n in enumerate(views[start : start + batch])]
             job = {"config": dataclasses.asdict(config), "split": split, "episodes": episodes}
             jobs[f"{split}_{start:06d}"] = job
     return jobs
@@ -81,7 +82,8 @@ def render_batch(job: dict) -> bytes:
         out = Path(folder) / "batch.zip"
         path = os.pathsep.join([str(Path(__file__).resolve().parents[1]), os.environ.get("PYTHONPATH", "")])
         # as many children as cores, so one thread in each
-        env = {"MMGSD_THREADS": "1", "OMP_NUM_THREADS": "1", **os.environ, "PYTHONPATH": path}
+        one = {"MMGSD_THREADS": "1", "OMP_NUM_THREADS": "1", "OIDN_NUM_THREADS": "1", "OIDN_SET_AFFINITY": "0"}
+        env = {**one, **os.environ, "PYTHONPATH": path}
         text = json.dumps({**job, "out": str(out)})
         command = [sys.executable, "-m", "mmgsd.scene"]
         done = subprocess.run(command, input=text, env=env, capture_output=True, text=True)

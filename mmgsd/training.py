@@ -122,7 +122,7 @@ class _Run:
         self.permutations = torch.tensor(known, device=device)
         self.images = load_training_images(data, config.input_px)
         torch.manual_seed(config.seed)
-        network = build_network(config.network, config.descriptor_dim).to(device)
+        network = build_network(config.network, config.descriptor_dim, trunk_weights=config.trunk_weights).to(device)
         self.network = network.to(memory_format=torch.channels_last)
         # the average of the last steps' weights, statistics of batch normalisation included, is what is kept
         average = get_ema_multi_avg_fn(1 - 1 / max(2.0, config.steps / 50))

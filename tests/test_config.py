@@ -22,10 +22,10 @@ from mmgsd.config import (
 )
 
 OTHER = {  # another accepted value for the fields that are no plain numbers or flags
-    "object": "cloth", "method": "pcl", "group": "identity", "network": "resnet34", "schedule": "step",
-    "rotation_deg": 45.0,
+    "object": "cloth", "method": "pcl", "group": "identity", "network": "lite0", "trunk_weights": "w.safetensors",
+    "schedule": "step", "rotation_deg": 45.0,
 }  # fmt: skip
-CONFIGS = (RenderConfig(object="rope"), TrainConfig(object="rope"), EvaluateConfig(points=600))
+CONFIGS = (RenderConfig(object="rope"), TrainConfig(object="rope", network="resnet34"), EvaluateConfig(points=600))
 FIELDS = [(config, field.name) for config in CONFIGS for field in dataclasses.fields(config)]
 
 

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 import torch
+from safetensors.torch import save_file
+from torch import Tensor
 
 from mmgsd.network import (
     ResNet34Trunk,
@@ -57,6 +61,33 @@ def test_every_used_parameter_gets_a_gradient(name: str) -> None:
     network = build_network(name, 4, pretrained=False)
     network(torch.rand(2, 3, 64, 64)).square().sum().backward()
     assert [n for n, p in network.named_parameters() if p.grad is None] == []
+
+
+def write_torchvision_weights(path: Path) -> dict[str, Tensor]:
+    """A file as torchvision's: the trunk, and a classifier that is not used."""
+    torch.manual_seed(3)
+    state = {**ResNet34Trunk().state_dict(), "fc.weight": torch.zeros(1000, 512), "fc.bias": torch.zeros(1000)}
+    save_file(state, path)
+    return state
+
+
+def test_imagenet_weights_load_from_a_file_and_the_classifier_is_left_out(tmp_path: Path) -> None:
+    state = write_torchvision_weights(tmp_path / "resnet34.safetensors")
+    network = build_network("resnet34", 3, trunk_weights=tmp_path / "resnet34.safetensors")
+    assert all(torch.equal(value, state[name]) for name, value in network.trunk.state_dict().items())
+
+
+def test_weights_of_something_else_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "w.safetensors"
+    with pytest.raises(FileNotFoundError, match=r"w\.safetensors does not exist"):
+        build_network("resnet34", 3, trunk_weights=path)
+    state = write_torchvision_weights(path)
+    path.write_bytes(path.read_bytes()[:5000])
+    with pytest.raises(ValueError, match="truncated or no safetensors"):
+        build_network("resnet34", 3, trunk_weights=path)
+    save_file({name: value for name, value in state.items() if "layer4" not in name}, path)
+    with pytest.raises(ValueError, match="does not hold torchvision's ResNet-34"):
+        build_network("resnet34", 3, trunk_weights=path)
 
 
 def test_unknown_network() -> None:

@@ -22,7 +22,7 @@ from pathlib import Path
 from mmgsd import rendering
 from mmgsd.config import RenderConfig
 if __name__ == "__main__":
-    rendering.EPISODES_A_BATCH = 1
+    rendering.IMAGES_A_BATCH = 1
     config = RenderConfig(object="rope", train_images=3, test_images=2, views=1, samples=1, seed=5)
     rendering.render_dataset(config, Path(sys.argv[1]), workers=int(sys.argv[2]), progress=False)
 """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import bpy
@@ -16,8 +17,9 @@ POINTS_SIDE = 25
 EXTENT = 1.0  # m
 SPACING = EXTENT / (SIDE - 1)
 VISIBILITY_RADIUS = 0.004  # m; less than the distance that self-collision keeps between two layers
-STATES = {"flat": 0.10, "wrinkled": 0.20, "folded": 0.20, "folded twice": 0.20, "corner": 0.15, "crumpled": 0.15}
+STATES = {"flat": 0.10, "wrinkled": 0.24, "folded": 0.26, "folded twice": 0.10, "corner": 0.20, "crumpled": 0.10}
 SETTLE_FRAMES = 8
+ATTEMPTS = 3  # at a move, before the cloth starts anew
 MAX_STRETCH = 1.22  # of the 99th percentile of edges
 MAX_HEIGHT = 0.17  # m
 MAX_CROSSINGS = 12  # pairs of quads, of 2304, that cut each other: more are seen as spots of the other layer
@@ -55,12 +57,27 @@ def deform(rng: np.random.Generator, state: str) -> tuple[np.ndarray, int]:
     frames = 0
     while True:
         vertices = _rippled(rng, 0.001 if state == "flat" else 0.008)
-        for plan in _PLANS[state]:
+        for move in _MOVES[state]:
+            vertices, count = _perform(rng, vertices, move)
+            frames += count
+            if vertices is None:
+                break
+        else:
+            return vertices, frames
+
+
+def _perform(rng: np.random.Generator, start: np.ndarray, move: tuple[Plan, ...]) -> tuple[np.ndarray | None, int]:
+    """The vertices after a move, None where it failed too often, and the frames of physics that all attempts took."""
+    frames = 0
+    for _ in range(ATTEMPTS):
+        vertices = start.copy()
+        for plan in move:
             grasps, count = plan(rng, vertices)
             vertices = _simulate(vertices, grasps, count)
             frames += count
         if _is_plausible(vertices):
             return vertices, frames
+    return None, frames
 
 
 def _is_plausible(vertices: np.ndarray) -> bool:
@@ -97,7 +114,9 @@ def _rippled(rng: np.random.Generator, height: float) -> np.ndarray:
     return vertices
 
 
-# Plans: (rng, vertices) -> (grasps, frames) of one simulation. ------------------------------------------------------
+# Plans: (rng, vertices) -> (grasps, frames) of one simulation; they may move the vertices first. --------------------
+
+Plan = Callable[[np.random.Generator, np.ndarray], tuple[list[Grasp], int]]
 
 
 def _settle(rng: np.random.Generator, vertices: np.ndarray) -> tuple[list[Grasp], int]:
@@ -179,13 +198,14 @@ def _arc(shift: np.ndarray, height: float, frames: int) -> np.ndarray:
     return np.concatenate([path, np.repeat(path[-1:], hold, axis=0)])
 
 
-_PLANS = {
-    "flat": (_settle,),
-    "wrinkled": (_drop, _drag, _settle),
-    "folded": (_fold, _settle),
-    "folded twice": (_fold, _fold, _settle),
-    "corner": (_fold_corner, _settle),
-    "crumpled": (_gather, _settle),
+# Moves follow each other; each is made of plans and tried again from where it began if the cloth comes to no good.
+_MOVES: dict[str, tuple[tuple[Plan, ...], ...]] = {
+    "flat": ((_settle,),),
+    "wrinkled": ((_drop, _drag, _settle),),
+    "folded": ((_fold, _settle),),
+    "folded twice": ((_fold,), (_fold, _settle)),
+    "corner": ((_fold_corner, _settle),),
+    "crumpled": ((_gather, _settle),),
 }
 
 
@@ -238,7 +258,7 @@ def _add_physics(cloth: bpy.types.Object, pinned: list[int], frames: int) -> Non
     settings, collision = modifier.settings, modifier.collision_settings
     settings.rest_shape_key = cloth.data.shape_keys.key_blocks["rest"]
     settings.vertex_group_mass = "pinned"
-    settings.quality = 3
+    settings.quality = 3  # with 2, most crumpled cloths cut through themselves
     settings.bending_stiffness = 0.2
     collision.use_self_collision = True
     collision.self_distance_min = 0.006  # under a third of an edge: neighbours must not push each other

@@ -1,0 +1,78 @@
+"""How fast data sets are rendered, and where the time goes: ``python tests/bench/bench_rendering.py [images]``.
+
+Renders ``images`` (default 300) of each object at the paper's size with as many workers as there are cores, exactly as
+`render_dataset` does it: processes started, physics, labels and writing included. Then one episode more in a
+process of its own, with a clock on each step.
+"""
+
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from mmgsd.config import OBJECTS, RenderConfig
+from mmgsd.rendering import render_dataset
+
+SEED = 1234  # not a preset's: nobody trains on these
+SPLIT = """
+import io, os, sys, time, zipfile
+os.environ.setdefault("MMGSD_THREADS", "1")
+from mmgsd.config import RenderConfig
+from mmgsd.scene.__main__ import one_core, silenced, write_view
+clock = {}
+def timed(module, name, label):
+    function = getattr(module, name)
+    def wrapper(*args, **kwargs):
+        start = time.perf_counter()
+        try:
+            return function(*args, **kwargs)
+        finally:
+            clock[label] = clock.get(label, 0.0) + time.perf_counter() - start
+    setattr(module, name, wrapper)
+begin = time.perf_counter()
+with silenced():
+    with one_core():
+        from mmgsd.scene import episode, render, randomize
+    clock["start of Blender (once a process)"] = time.perf_counter() - begin
+    timed(episode, "build_object", "shape (physics or geometry)")
+    timed(render, "build_bvh", "labels: tree")
+    timed(render, "find_visible", "labels: ray casts")
+    timed(render, "render_image", "Cycles and denoiser")
+    timed(randomize, "draw_object_material", "materials")
+    timed(randomize, "draw_background", "materials")
+    views = []
+    for number in range(4):
+        views += episode.render_episode(RenderConfig(object=sys.argv[1], seed=int(sys.argv[2])), "train", number, 10)
+    start = time.perf_counter()
+    with zipfile.ZipFile(io.BytesIO(), "w") as archive:
+        for i, view in enumerate(views):
+            write_view(archive, 0, i, view)
+    clock["encoding"] = time.perf_counter() - start
+for label, seconds in clock.items():
+    print(f"  {label:36s}{seconds / len(views):8.4f} s an image")
+print(f"  {'all':36s}{(time.perf_counter() - begin) / len(views):8.4f} s an image, 1 process")
+"""
+
+
+def measure_throughput(kind: str, images: int) -> float:
+    """Images a second of the whole stage."""
+    config = RenderConfig(object=kind, train_images=images - images // 8, test_images=images // 8, seed=SEED)
+    with tempfile.TemporaryDirectory() as folder:
+        start = time.perf_counter()
+        render_dataset(config, Path(folder) / kind, progress=False)
+        return images / (time.perf_counter() - start)
+
+
+def main() -> None:
+    """Print the split, then the line that is compared."""
+    images = int(sys.argv[1]) if len(sys.argv) > 1 else 300
+    for kind in OBJECTS:
+        print(f"{kind}, 40 images:", flush=True)
+        subprocess.run([sys.executable, "-c", SPLIT, kind, str(SEED)], check=True)
+    rates = [f"{kind} {measure_throughput(kind, images):.2f} images/s" for kind in OBJECTS]
+    print(", ".join(rates))
+
+
+if __name__ == "__main__":
+    main()
