@@ -35,7 +35,7 @@ from mmgsd.network import (
 )
 from mmgsd.prototypes import compute_prototype_loss, make_prototypes
 
-WEIGHTS, CHECKPOINT, LOG = "weights.safetensors", "checkpoint.pt", "log.csv"
+WEIGHTS, CHECKPOINT, LOG = "weights.safetensors", "checkpoint.safetensors", "log.csv"
 PROTOTYPE_EVERY = 4  # each step asks every so many material points
 CHECKPOINT_SECONDS = 60.0  # of training between two checkpoints
 
@@ -169,18 +169,15 @@ class _Run:
     def save(self) -> None:
         """Write a checkpoint aside, then rename it."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        state = {
-            "config": json.dumps(dataclasses.asdict(self.config)),
-            "network": self.network.state_dict(),
-            "average": self.average.state_dict(),
-            "prototypes": self.prototypes.detach(),
-            "optimiser": self.optimiser.state_dict(),
-            "step": self.step,
-            "seconds": self.seconds,
-            "log": self.log,
-        }
+        tensors = {"prototypes": self.prototypes.detach()}
+        for part in ("network", "average"):
+            tensors |= {f"{part}/{name}": value for name, value in getattr(self, part).state_dict().items()}
+        for index, values in self.optimiser.state_dict()["state"].items():
+            tensors |= {f"optimiser/{index}/{name}": value for name, value in values.items()}
+        numbers = {"step": self.step, "seconds": self.seconds, "log": self.log}
+        metadata = {"config": self._describe_config(), "numbers": json.dumps(numbers)}
         aside = self.folder / (CHECKPOINT + ".tmp")
-        torch.save(state, aside)
+        save_file({name: value.contiguous() for name, value in tensors.items()}, aside, metadata)
         os.replace(aside, self.folder / CHECKPOINT)
         self.saved_at = self.seconds
 
@@ -189,14 +186,29 @@ class _Run:
         path = self.folder / CHECKPOINT
         if not path.is_file():
             return
-        state = torch.load(path, map_location=self.device, weights_only=True)
-        if state["config"] != json.dumps(dataclasses.asdict(self.config)):
+        with safe_open(path, "pt", device=str(self.device)) as file:
+            metadata = file.metadata()
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        if metadata["config"] != self._describe_config():
             raise ValueError(f"{path} belongs to another configuration: choose another folder or overwrite=True")
-        for name in ("network", "average", "optimiser"):
-            getattr(self, name).load_state_dict(state[name])
-        self.prototypes.data.copy_(state["prototypes"])
-        self.step, self.seconds, self.log = state["step"], state["seconds"], state["log"]
+        self.prototypes.data.copy_(tensors.pop("prototypes"))
+        parts = {"network": {}, "average": {}, "optimiser": {}}
+        for name, value in tensors.items():
+            part, rest = name.split("/", 1)
+            parts[part][rest] = value
+        self.network.load_state_dict(parts["network"])
+        self.average.load_state_dict(parts["average"])
+        state = {}
+        for name, value in parts["optimiser"].items():
+            index, field = name.split("/")
+            state.setdefault(int(index), {})[field] = value
+        self.optimiser.load_state_dict({**self.optimiser.state_dict(), "state": state})
+        numbers = json.loads(metadata["numbers"])
+        self.step, self.seconds, self.log = numbers["step"], numbers["seconds"], numbers["log"]
         self.saved_at = self.seconds
+
+    def _describe_config(self) -> str:
+        return json.dumps(dataclasses.asdict(self.config))
 
     def finish(self, weights: Path) -> Path:
         """Write log and weights, the weights last: a folder that has them is finished."""

@@ -28,6 +28,7 @@ from mmgsd.training import (
     compute_learning_rate,
     compute_loss,
     compute_sigma,
+    load_metadata,
     load_training_images,
     make_batch,
     train_model,
@@ -116,7 +117,7 @@ def test_overwrite_trains_again_to_the_same_weights(cloth_dataset: Path, tmp_pat
 def test_a_killed_run_ends_with_the_same_weights(cloth_dataset: Path, tmp_path: Path) -> None:
     train_and_kill(LONGER, cloth_dataset, tmp_path / "killed")
     assert not (tmp_path / "killed" / training.WEIGHTS).exists()
-    assert torch.load(tmp_path / "killed" / CHECKPOINT, weights_only=True)["step"] == HANG_IN_STEP
+    assert json.loads(load_metadata(tmp_path / "killed" / CHECKPOINT)["numbers"])["step"] == HANG_IN_STEP
     resumed = load_file(train(LONGER, cloth_dataset, tmp_path / "killed"))
     undisturbed = load_file(train(LONGER, cloth_dataset, tmp_path / "undisturbed"))
     torch.testing.assert_close(resumed, undisturbed, rtol=0, atol=1e-6)
@@ -129,7 +130,7 @@ def test_a_checkpoint_of_another_configuration(
     monkeypatch.setattr(training, "CHECKPOINT_SECONDS", 0)
     monkeypatch.setattr(training._Run, "finish", lambda run, weights: weights)  # as if killed just before
     train(ONE_STEP, cloth_dataset, tmp_path)
-    with pytest.raises(ValueError, match="checkpoint.pt belongs to another configuration: .*overwrite=True"):
+    with pytest.raises(ValueError, match="checkpoint.safetensors belongs to another configuration: .*overwrite=True"):
         train(dataclasses.replace(ONE_STEP, seed=1), cloth_dataset, tmp_path)
 
 
