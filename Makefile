@@ -14,6 +14,8 @@ PYTHON ?= $(shell for p in python3.11 python3 python; do \
 TORCH_INDEX ?=
 # CUDA=1 installs torch with CUDA instead of the CPU build.
 CUDA ?=
+# make data-pack, data-unpack, data-sample: which data sets.
+PRESET ?= paper
 # make lock: the uv program, and a folder that holds torch's CPU wheel.
 UV ?= uv
 FIND_LINKS ?=
@@ -29,7 +31,8 @@ PIP := env -u PYTHONDONTWRITEBYTECODE $(PY) -m pip --disable-pip-version-check i
 STAMP := .venv/.installed
 PAPERMILL := $(PY) -m papermill --kernel python3
 
-.PHONY: help .venv reproduce smoke test lint unit notebooks-test readme lab lock clean clean-all force
+.PHONY: help .venv reproduce smoke test lint unit notebooks-test readme data-pack data-unpack data-sample lab lock \
+	clean clean-all force
 
 help: ## List the targets
 	@grep -hE '^[.a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | awk -F'\t' '{ printf "  make %-15s %s\n", $$1, $$2 }'
@@ -57,6 +60,15 @@ notebooks-test: $(STAMP) ## Run the notebooks and compare their outputs with the
 
 readme: $(STAMP) ## Put the numbers of data/results/quick into the README
 	$(PY) -m mmgsd.tables data/results/quick README.md
+
+data-pack: $(STAMP) ## Pack the data sets of PRESET (paper) into data/packs, to travel to another machine
+	$(PY) -m mmgsd.packing pack $(PRESET)
+
+data-unpack: $(STAMP) ## Unpack them there; the SHA-256 must be that of the note beside the archive
+	$(PY) -m mmgsd.packing unpack $(PRESET)
+
+data-sample: $(STAMP) ## Copy 24 images of each object of PRESET into data/sample
+	$(PY) -m mmgsd.packing sample $(PRESET)
 
 lab: $(STAMP) ## Open the notebooks in JupyterLab
 	$(PY) -m jupyterlab notebooks

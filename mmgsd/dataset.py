@@ -73,8 +73,8 @@ class Dataset:
 
     @property
     def fingerprint(self) -> str:
-        """Sixteen hexadecimal digits of what was rendered and with which versions."""
-        text = json.dumps([self.info["config"], self.info["versions"]], sort_keys=True)
+        """Sixteen hexadecimal digits of what was rendered, with which versions, and how it was packed, if it was."""
+        text = json.dumps([self.info[k] for k in ("config", "versions", "packed") if k in self.info], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def group(self, name: str = "") -> SymmetryGroup:
@@ -129,6 +129,21 @@ def check_dataset(folder: Path | str) -> pd.DataFrame:
     return pd.DataFrame(rows).set_index("split")
 
 
+def measure_images(data: Dataset) -> pd.DataFrame:
+    """What the images of a split are like, one row an image.
+
+    ``state``, the ``visible`` share of the material points, and the median colours (3,) of the pixels on and off the
+    object's mask, ``object_colour`` and ``background_colour``.
+    """
+    rows = []
+    for index in range(len(data)):
+        image, mask = data.load_image(index), data.load_mask(index)
+        colours = {"object_colour": np.median(image[mask], 0), "background_colour": np.median(image[~mask], 0)}
+        rows.append({"visible": data.visible[index].mean(), **colours})
+    state = data.labels.get("state", "unknown")
+    return pd.DataFrame(rows).assign(state=state)
+
+
 def sample_pairs(
     episode: np.ndarray, n_pairs: int, rng: np.random.Generator, *, same_episode: bool = False
 ) -> np.ndarray:
@@ -156,7 +171,7 @@ def encode_image(image: np.ndarray) -> bytes:
 def encode_mask(mask: np.ndarray) -> bytes:
     """1-bit PNG bytes of an (H, W) bool mask."""
     buffer = io.BytesIO()
-    Image.fromarray(mask).save(buffer, "PNG")
+    Image.fromarray(mask).save(buffer, "PNG", optimize=True)
     return buffer.getvalue()
 
 

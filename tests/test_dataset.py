@@ -10,7 +10,15 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from mmgsd.dataset import DatasetError, check_dataset, encode_image, encode_mask, load_dataset, sample_pairs
+from mmgsd.dataset import (
+    DatasetError,
+    check_dataset,
+    encode_image,
+    encode_mask,
+    load_dataset,
+    measure_images,
+    sample_pairs,
+)
 
 IMAGE, MASK = "images/00000.webp", "masks/00000.png"
 
@@ -182,3 +190,13 @@ def test_pairs_are_those_of_the_seed() -> None:
 def test_one_image_makes_no_pair(rng: np.random.Generator) -> None:
     with pytest.raises(ValueError, match="episode must hold at least 2 images to make a pair, got 1"):
         sample_pairs(np.zeros(1, dtype=int), 1, rng)
+
+
+def test_measured_images_are_those_of_the_pixels(cloth_dataset: Path) -> None:
+    data = load_dataset(cloth_dataset, "train")
+    table = measure_images(data)
+    image, mask = data.load_image(2), data.load_mask(2)
+    np.testing.assert_array_equal(table.object_colour[2], np.median(image[mask], 0))
+    np.testing.assert_array_equal(table.background_colour[2], np.median(image[~mask], 0))
+    assert table.visible.to_list() == [1.0] * len(data)
+    assert set(table.state) == {"flat"}

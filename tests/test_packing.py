@@ -1,0 +1,91 @@
+"""Packing: small, repeatable, nearly lossless; an archive that is not what its note says is not unpacked."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mmgsd import packing
+from mmgsd.config import OBJECTS
+from mmgsd.dataset import check_dataset, load_dataset
+from mmgsd.packing import LABEL_STEP, pack_dataset, unpack_dataset, write_sample
+
+SAMPLE = Path(__file__).resolve().parents[1] / "data" / "sample"
+
+
+@pytest.fixture
+def archive(cloth_dataset: Path, tmp_path: Path) -> Path:
+    """The shared cloth data set, packed."""
+    pack_dataset(cloth_dataset, tmp_path / "cloth.zip", progress=False)
+    return tmp_path / "cloth.zip"
+
+
+def test_what_is_unpacked_is_what_was_packed(archive: Path, cloth_dataset: Path, tmp_path: Path) -> None:
+    unpacked = unpack_dataset(archive, tmp_path / "back")
+    for split in ("train", "test"):
+        before, after = load_dataset(cloth_dataset, split), load_dataset(unpacked, split)
+        assert np.abs(before.xy - after.xy).max() <= LABEL_STEP / 2 + 1e-5
+        assert np.array_equal(before.visible, after.visible)
+        for i in range(len(before)):
+            assert np.array_equal(before.load_mask(i), after.load_mask(i))
+            assert np.abs(before.load_image(i).astype(int) - after.load_image(i)).mean() < 3.0
+    assert before.fingerprint != after.fingerprint  # a model must say which of the two it was trained on
+
+
+def test_same_data_same_bytes(archive: Path, cloth_dataset: Path, tmp_path: Path) -> None:
+    note = pack_dataset(cloth_dataset, tmp_path / "again.zip", progress=False)
+    assert (tmp_path / "again.zip").read_bytes() == archive.read_bytes()
+    assert note == json.loads(archive.with_suffix(".json").read_text())
+
+
+def test_a_damaged_archive_is_refused_and_leaves_nothing(archive: Path, tmp_path: Path) -> None:
+    data = bytearray(archive.read_bytes())
+    data[len(data) // 2] ^= 1
+    archive.write_bytes(data)
+    with pytest.raises(ValueError, match=r"cloth\.zip is damaged or another file: its SHA-256 is"):
+        unpack_dataset(archive, tmp_path / "back")
+    assert not (tmp_path / "back").exists()
+
+
+@pytest.mark.parametrize("name", ["../evil.webp", "images/../../evil.webp", "/etc/evil.webp", "run.py", "images/a.py"])
+def test_files_of_no_data_set_are_refused(archive: Path, tmp_path: Path, name: str) -> None:
+    with zipfile.ZipFile(archive, "a") as target:
+        target.writestr(name, b"")
+    note = json.loads(archive.with_suffix(".json").read_text())
+    note["sha256"] = packing.hashlib.sha256(archive.read_bytes()).hexdigest()
+    archive.with_suffix(".json").write_text(json.dumps(note))
+    with pytest.raises(ValueError, match="which is no file of a data set"):
+        unpack_dataset(archive, tmp_path / "folder" / "back")
+    assert not list(tmp_path.rglob("evil*"))
+
+
+def test_bad_arguments(archive: Path, cloth_dataset: Path, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="quality must be between 1 and 100, got 0"):
+        pack_dataset(cloth_dataset, tmp_path / "x.zip", quality=0)
+    with pytest.raises(FileExistsError, match="exists: remove it first"):
+        unpack_dataset(archive, tmp_path)
+    with pytest.raises(FileNotFoundError, match="an archive and its note belong together"):
+        unpack_dataset(tmp_path / "none.zip", tmp_path / "back")
+
+
+def test_a_sample_shows_different_simulations(
+    tiny_dataset: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(packing, "SAMPLE", {"train": 3, "test": 1})
+    folder = tiny_dataset(n_train=8, n_test=2)
+    sample = write_sample(folder, tmp_path / "sample")
+    assert load_dataset(sample, "train").labels.episode.is_unique
+    assert check_dataset(sample).images.to_list() == [3, 1]
+    with pytest.raises(ValueError, match="must show at least 3 simulations in train, got 2"):
+        write_sample(tiny_dataset(object="rope", n_train=4, n_test=2), tmp_path / "other")
+
+
+@pytest.mark.parametrize("name", OBJECTS)
+def test_the_committed_sample_is_whole_and_small(name: str) -> None:
+    assert check_dataset(SAMPLE / name).images.to_list() == [16, 8]
+    assert sum(path.stat().st_size for path in (SAMPLE / name).rglob("*")) < 1_500_000
