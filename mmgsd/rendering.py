@@ -19,6 +19,7 @@ import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 from dask.distributed import Client, LocalCluster, as_completed
 from tqdm.auto import tqdm
@@ -167,5 +168,6 @@ def _unpack(path: Path, folder: Path) -> Iterator[dict]:
             (folder / names["file"]).write_bytes(batch.read(f"{stem}.webp"))
             (folder / names["mask"]).write_bytes(batch.read(f"{stem}_mask.png"))
             flat = {key: [v for row in label.pop(key) for v in row] for key in ("xy", "intrinsics", "camera_pose")}
+            flat["xy"] = np.float32(flat["xy"])
             label["episode"] += 1_000_000 * (split == "test")
             yield {**names, **flat, **label.pop("info"), **label}

@@ -8,7 +8,9 @@ import sys
 import time
 from pathlib import Path
 
+import psutil
 import pytest
+from dask.distributed import LocalCluster
 
 from mmgsd import rendering
 from mmgsd.config import RenderConfig
@@ -24,16 +26,18 @@ from mmgsd.config import RenderConfig
 if __name__ == "__main__":
     rendering.IMAGES_A_BATCH = 1
     config = RenderConfig(object="rope", train_images=3, test_images=2, views=1, samples=1, seed=5)
-    rendering.render_dataset(config, Path(sys.argv[1]), workers=int(sys.argv[2]), progress=False)
+    how = {"workers": int(sys.argv[2]), "scheduler": sys.argv[3]}
+    rendering.render_dataset(config, Path(sys.argv[1]), progress=False, **how)
 """
 
 
-def start(folder: Path, workers: int) -> subprocess.Popen:
+def start(folder: Path, workers: int, scheduler: str = "") -> subprocess.Popen:
     script = folder.parent / "render.py"
     script.write_text(SCRIPT)
     path = str(Path(rendering.__file__).resolve().parents[1])
     env = {**os.environ, "PYTHONPATH": path}
-    return subprocess.Popen([sys.executable, str(script), str(folder), str(workers)], env=env, start_new_session=True)
+    command = [sys.executable, str(script), str(folder), str(workers), scheduler]
+    return subprocess.Popen(command, env=env, start_new_session=True)
 
 
 def read_tree(folder: Path) -> dict[str, bytes]:
@@ -66,6 +70,31 @@ def test_a_killed_rendering_goes_on_and_ends_with_the_same_bytes(tmp_path: Path)
     assert check_dataset(killed).images.to_list() == [3, 2]
     with pytest.raises(ValueError, match="seed: 5 there, 6 asked for"):
         render_dataset(dataclasses.replace(CONFIG, seed=6), killed)
+
+
+def test_a_lost_worker_of_a_foreign_cluster_costs_nothing_but_time(tmp_path: Path) -> None:
+    """The scheduler is given by its address; one of its workers is killed while it renders."""
+    undisturbed, disturbed = tmp_path / "undisturbed", tmp_path / "disturbed"
+    assert start(undisturbed, 1).wait(300) == 0
+    with LocalCluster(n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address="127.0.0.1:0") as cluster:
+        first = {worker.pid for worker in cluster.workers.values()}
+        process = start(disturbed, 0, cluster.scheduler_address)
+        killed = wait_for_rendering_worker(first)
+        os.kill(killed, signal.SIGKILL)
+        assert process.wait(300) == 0
+        assert killed not in {worker.pid for worker in cluster.workers.values()}
+    assert read_tree(undisturbed) == read_tree(disturbed)
+
+
+def wait_for_rendering_worker(pids: set[int]) -> int:
+    """The first of the worker processes that has a Blender child."""
+    deadline = time.monotonic() + 120
+    while time.monotonic() < deadline:
+        for pid in pids:
+            if any("mmgsd.scene" in " ".join(child.cmdline()) for child in psutil.Process(pid).children()):
+                return pid
+        time.sleep(0.02)
+    raise AssertionError("no worker began to render")
 
 
 def test_a_folder_begun_with_another_configuration_is_not_mixed(tmp_path: Path) -> None:
