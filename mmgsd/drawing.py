@@ -46,11 +46,12 @@ _STYLE = seaborn.axes_style("ticks") | seaborn.plotting_context("paper") | {
 styled = matplotlib.rc_context(_STYLE)
 
 
-def save_figure(figure: Figure, path: Path) -> list[Path]:
-    """Write ``path`` as PDF without a date (a second run gives the same bytes) and as PNG of 200 dpi; both paths."""
+def save_figure(figure: Figure, path: Path, kinds: Sequence[str] = ("pdf", "png")) -> list[Path]:
+    """Write ``path`` as PDF without a date (a second run gives the same bytes) and as PNG of 200 dpi; the paths."""
     path.parent.mkdir(parents=True, exist_ok=True)
     written = []
-    for kind, metadata in (("pdf", {"CreationDate": None}), ("png", {})):
+    for kind in kinds:
+        metadata = {"CreationDate": None} if kind == "pdf" else None
         target, aside = path.with_suffix(f".{kind}"), path.with_suffix(f".{kind}.tmp")
         with matplotlib.rc_context(_STYLE):
             figure.savefig(aside, format=kind, dpi=200, metadata=metadata, bbox_inches="tight", pad_inches=0.01)

@@ -9,6 +9,7 @@ import pandas as pd
 from matplotlib import colormaps
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
+from matplotlib.colors import hsv_to_rgb, rgb_to_hsv
 from matplotlib.figure import Figure
 from scipy.ndimage import gaussian_filter1d
 
@@ -34,6 +35,7 @@ from mmgsd.drawing import (
 )
 from mmgsd.matching import Match
 
+_ORBIT_COLOURS = ("#D55E00", "#56B4E9", "#FFE100", "#009E73")
 DENSITY_STEP, SEGMENTS = 0.25, 25  # % of the object's size between points of a density; segments of a rope
 
 
@@ -235,6 +237,58 @@ def plot_labels(
         axis.scatter(*chosen.T, s=50, facecolors="none", edgecolors="black", linewidths=2.2)
         axis.scatter(*chosen.T, s=50, facecolors="none", edgecolors=MARK, linewidths=1.2)
     return figure
+
+
+@styled
+def plot_orbits(image: np.ndarray, xy: np.ndarray, groups: Mapping[str, Sequence[Sequence[int]]]) -> Figure:
+    """A panel a symmetry group ({name: orbits, each of indices into ``xy`` (P, 2) px}), an orbit a colour."""
+    check_filled("groups", groups)
+    figure, axes = make_grid([image.shape[0] / image.shape[1]], len(groups), PAGE_IN)
+    for axis, (name, orbits) in zip(axes[0], groups.items(), strict=True):
+        axis.imshow(fade_image(image))
+        axis.autoscale(False)
+        for colour, orbit in zip(_ORBIT_COLOURS, orbits, strict=False):
+            axis.scatter(*xy[list(orbit)].T, s=26, color=colour, edgecolors="black", linewidths=0.6)
+        axis.set_title(name)
+    return figure
+
+
+@styled
+def plot_variety(tables: Mapping[str, pd.DataFrame], modes: Mapping[str, Mapping[str, Sequence[int]]]) -> Figure:
+    """How the images differ, a row an object: states, visible share, hue of object and background, modes a point.
+
+    ``tables`` {object: `mmgsd.dataset.measure_images`}, ``modes`` {object: {group: (P,) modes of each point}}.
+    """
+    check_filled("tables", tables)
+    figure, axes = plt.subplots(len(tables), 4, figsize=(PAGE_IN, 1.6 * len(tables)), layout="constrained",
+                                squeeze=False)  # fmt: skip
+    for line, (name, table) in zip(axes, tables.items(), strict=True):
+        share = 100 * table.state.value_counts(normalize=True).sort_index()
+        line[0].barh(share.index, share, color="0.5")
+        line[0].set(xlabel="Images (%)", title=name.capitalize())
+        line[1].hist(100 * table.visible, np.arange(0, 101, 5), color="0.5")
+        line[1].set(xlabel="Visible material points (%)", ylabel="Images", xlim=(0, 100))
+        _draw_hues(line[2], table)
+        counts = pd.DataFrame({g: pd.Series(m).value_counts() for g, m in modes[name].items()}).sort_index()
+        counts.T.plot.bar(stacked=True, ax=line[3], colormap="viridis", width=0.7, rot=0)
+        line[3].set(ylabel="Material points", xlabel="")
+        line[3].tick_params("x", rotation=45)
+        line[3].legend(title="Modes", loc="center left", bbox_to_anchor=(1, 0.5), fontsize=6, title_fontsize=6)
+    return finish_axes(figure)
+
+
+def _draw_hues(axis: Axes, table: pd.DataFrame) -> None:
+    """Histogram of hue, object upwards and background downwards, greys in a bar of their own at the left."""
+    edges = np.linspace(0, 1, 13)
+    for part, sign in (("object", 1), ("background", -1)):
+        hsv = rgb_to_hsv(np.stack(table[f"{part}_colour"].to_list()) / 255)
+        vivid = hsv[:, 1] > 0.15
+        counts = sign * np.histogram(hsv[vivid, 0], edges)[0]
+        colours = hsv_to_rgb(np.stack([edges[:-1] + 1 / 24, np.full(12, 0.65), np.full(12, 0.85)], -1))
+        axis.bar(edges[:-1], counts, 1 / 12, align="edge", color=colours)
+        axis.bar(-1 / 12, sign * np.sum(~vivid), 1 / 12, align="edge", color="0.6")
+    axis.axhline(0, color="black", lw=0.6)
+    axis.set(xlabel="Hue (left: greys)", ylabel="Background | object", xticks=[])
 
 
 def compute_object_size(masks: Sequence[np.ndarray]) -> float:

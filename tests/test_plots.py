@@ -160,6 +160,27 @@ def test_plot_labels_checks_shapes():
         plots.plot_labels(np.zeros((4, 4, 3), np.uint8), np.zeros((3, 2)), np.ones(2, bool))
 
 
+def test_plot_orbits_draws_every_orbit_of_every_group(rng):
+    xy = rng.uniform(0, 40, (9, 2))
+    figure = plots.plot_orbits(np.zeros((40, 40, 3), np.uint8), xy, {"identity": [[0], [4]], "c4": [[0, 2, 6, 8], [4]]})
+    first, second = figure.axes
+    assert [len(c.get_offsets()) for c in first.collections] == [1, 1]
+    assert np.asarray(second.collections[0].get_offsets()) == pytest.approx(xy[[0, 2, 6, 8]])
+
+
+def test_plot_variety_counts_states_and_hues():
+    red, blue, grey = np.array([200.0, 0, 0]), np.array([0, 0, 200.0]), np.array([90.0, 90, 90])
+    table = pd.DataFrame({
+        "state": ["flat", "flat", "folded", "flat"], "visible": [1.0, 0.99, 0.5, 0.98],
+        "object_colour": [red, red, blue, red], "background_colour": [grey] * 4,
+    })  # fmt: skip
+    states, visible, hues, modes = plots.plot_variety({"cloth": table}, {"cloth": {"c4": [4, 4, 1]}}).axes
+    assert [bar.get_width() for bar in states.patches] == [75, 25]
+    assert [bar.get_height() for bar in visible.patches][10] == 1 and visible.patches[19].get_height() == 3
+    assert sorted(bar.get_height() for bar in hues.patches if bar.get_height()) == [-4, 1, 3]
+    assert [bar.get_height() for bar in modes.patches] == [1, 2]
+
+
 def test_compute_point_colours_differ_at_the_corners():
     colours = drawing.compute_point_colours("cloth")
     assert colours.shape == (625, 3) and colours.min() >= 0 and colours.max() <= 1
@@ -189,6 +210,8 @@ def test_save_figure_gives_the_same_bytes_twice(tmp_path):
     lambda: plots.plot_sigma_ablation({}),
     lambda: plots.plot_training({}),
     lambda: plots.plot_samples([]),
+    lambda: plots.plot_orbits(np.zeros((4, 4, 3), np.uint8), np.zeros((3, 2)), {}),
+    lambda: plots.plot_variety({}, {}),
     lambda: plots.compute_object_size([]),
 ])  # fmt: skip
 def test_empty_input_is_an_error(call):
