@@ -99,12 +99,22 @@ def _connect(workers: int, scheduler: str) -> Iterator[Client]:
         with Client(scheduler) as client:
             yield client
         return
-    local = LocalCluster(
+    with _unchanged_environment(), LocalCluster(
         n_workers=workers or os.cpu_count(), threads_per_worker=1, host="127.0.0.1", dashboard_address=None,
         silence_logs="ERROR",
-    )  # fmt: skip
-    with local, Client(local) as client:
+    ) as local, Client(local) as client:  # fmt: skip
         yield client
+
+
+@contextlib.contextmanager
+def _unchanged_environment() -> Iterator[None]:
+    """Dask sets OMP_NUM_THREADS=1 and more in this process for good: a training later on would get a single thread."""
+    before = dict(os.environ)
+    try:
+        yield
+    finally:
+        os.environ.clear()
+        os.environ.update(before)
 
 
 def _render_batches(client: Client, jobs: dict, partial: Path, config: RenderConfig, progress: bool) -> None:

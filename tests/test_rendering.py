@@ -76,7 +76,8 @@ def test_a_lost_worker_of_a_foreign_cluster_costs_nothing_but_time(tmp_path: Pat
     """The scheduler is given by its address; one of its workers is killed while it renders."""
     undisturbed, disturbed = tmp_path / "undisturbed", tmp_path / "disturbed"
     assert start(undisturbed, 1).wait(300) == 0
-    with LocalCluster(n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address="127.0.0.1:0") as cluster:
+    how = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
+    with rendering._unchanged_environment(), LocalCluster(n_workers=2, threads_per_worker=1, **how) as cluster:
         first = {worker.pid for worker in cluster.workers.values()}
         process = start(disturbed, 0, cluster.scheduler_address)
         killed = wait_for_rendering_worker(first)
@@ -84,6 +85,12 @@ def test_a_lost_worker_of_a_foreign_cluster_costs_nothing_but_time(tmp_path: Pat
         assert process.wait(300) == 0
         assert killed not in {worker.pid for worker in cluster.workers.values()}
     assert read_tree(undisturbed) == read_tree(disturbed)
+
+
+def test_rendering_leaves_the_environment_as_it_was(tmp_path: Path) -> None:
+    before = dict(os.environ)
+    render_dataset(dataclasses.replace(CONFIG, train_images=1, test_images=1), tmp_path / "rope", progress=False)
+    assert dict(os.environ) == before
 
 
 def wait_for_rendering_worker(pids: set[int]) -> int:
