@@ -121,7 +121,7 @@ lock: ## Make environment.lock from pyproject.toml (UV=uv, FIND_LINKS=folder wit
 # --- cleaning ----------------------------------------------------------------------------------------------------
 clean: ## Remove caches and what the preset smoke made
 	rm -rf .pytest_cache .ruff_cache .hypothesis data/generated/smoke data/results/smoke figures/smoke
-	rm -f data/generated/run_all_smoke.ipynb
+	rm -f data/generated/run_all_smoke.ipynb figures/data/smoke_*
 	find . -path ./.venv -prune -o \( -name __pycache__ -o -name .ipynb_checkpoints \) -type d -exec rm -rf {} +
 
 clean-all: clean ## Remove also .venv and everything generated: renders and trained models
