@@ -14,10 +14,14 @@ import cv2
 import numpy as np
 import scipy.ndimage
 import skimage.feature
+import torch
+from torch import Tensor
+
+from mmgsd.matching import Match, check_question, make_match
 
 BASELINES = ("sift", "orb", "akaze", "daisy", "surf")
 BINARY = ("orb", "akaze")  # compared by Hamming distance
-STRIDE_PX = 8
+STRIDE_PX = 8  # between the candidates on the object
 SHARPNESS = 2.0  # logits fall by this where the squared distance grows by its std over the object
 PAD_PX = 80  # reflected border: every window lies inside the padded image, so no detector drops a keypoint
 ANGLE_BINS, ANGLE_CELL_PX = 36, 4  # SIFT's orientation histogram; its gradients are pooled to cells of 4 px
@@ -40,6 +44,37 @@ WINDOWS = {
     "akaze": Window(8.0, octave=2, level=8),  # window 10 sizes; the third octave's first of four levels
     "surf": Window(27.0),  # window 20 scales of size * 1.2 / 9
 }
+
+
+def list_baselines() -> tuple[str, ...]:
+    """The methods that the installed OpenCV has: all, but SURF only where its non-free modules were built."""
+    return BASELINES if _has_surf() else BASELINES[:-1]
+
+
+class BaselineMatcher:
+    """Answers as `mmgsd.matching.Matcher` does, from hand-made descriptors; ValueError for a method not at hand."""
+
+    def __init__(self, method: str, *, modes: int = 1) -> None:
+        _check_choice(method)
+        _create_extractor(method)
+        self.method, self.modes = method, modes
+
+    def compute_heatmaps(
+        self, image0: np.ndarray, image1: np.ndarray, xy: np.ndarray, mask1: np.ndarray
+    ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+        """Heatmaps (S, h, w) and the centres (w,), (h,) px of their cells."""
+        heatmap, grid = compute_baseline_heatmap(image0, image1, xy, mask1, method=self.method)
+        return torch.from_numpy(heatmap), (torch.from_numpy(grid[0, :, 0]), torch.from_numpy(grid[:, 0, 1]))
+
+    def match(
+        self, image0: np.ndarray, image1: np.ndarray, xy: np.ndarray | list, *,
+        n: int | str | None = None, mask1: np.ndarray | None = None,
+    ) -> Match:  # fmt: skip
+        """As `Matcher.match`; ``mask1`` (H1, W1) bool tells where the object is in ``image1``, else anywhere."""
+        image0, image1, points = check_question(image0, image1, xy)
+        mask1 = np.ones(image1.shape[:2], bool) if mask1 is None else mask1
+        cells, centres = self.compute_heatmaps(image0, image1, points, mask1)
+        return make_match(image0, image1, points, cells, centres, self.modes if n is None else n)
 
 
 def compute_baseline_heatmap(
@@ -139,9 +174,13 @@ def _describe_keypoints(grey: np.ndarray, xy: np.ndarray, method: str) -> np.nda
     return descriptors.astype(np.float32)
 
 
+def _has_surf() -> bool:
+    return hasattr(getattr(cv2, "xfeatures2d", None), "SURF_create")
+
+
 def _create_extractor(method: str) -> cv2.Feature2D:
     if method == "surf":
-        if not hasattr(getattr(cv2, "xfeatures2d", None), "SURF_create"):
+        if not _has_surf():
             raise ValueError("method 'surf' needs an OpenCV with its non-free modules, got one without; accepted here: "
                              + ", ".join(map(repr, BASELINES[:-1])))  # fmt: skip
         return cv2.xfeatures2d.SURF_create()

@@ -7,6 +7,7 @@ images/*.webp     lossless colour images          masks/*.png    1-bit object ma
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import io
 import json
@@ -127,6 +128,17 @@ def check_dataset(folder: Path | str) -> pd.DataFrame:
     if train & test:
         raise DatasetError(f"{folder}: simulations {sorted(train & test)[:5]} are in both splits")
     return pd.DataFrame(rows).set_index("split")
+
+
+def hold_out(data: Dataset, *, share: float = 0.05) -> tuple[Dataset, Dataset]:
+    """The split without its last simulations, and these: ``share`` of them, at least one; all in both if only one."""
+    episodes = np.unique(data.episode)
+    last = episodes[-max(1, round(share * len(episodes))) :]
+    held = data.labels.episode.isin(last)
+    if held.all():
+        return data, data
+    parts = (data.labels[~held], data.labels[held])
+    return tuple(dataclasses.replace(data, labels=part.reset_index(drop=True)) for part in parts)
 
 
 def measure_images(data: Dataset) -> pd.DataFrame:

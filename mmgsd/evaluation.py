@@ -11,39 +11,48 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import torch
+from scipy.optimize import minimize_scalar
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from mmgsd.baselines import compute_baseline_heatmap
+from mmgsd.baselines import BaselineMatcher, list_baselines
 from mmgsd.config import N_POINTS, EvaluateConfig, digest
 from mmgsd.dataset import Dataset, load_dataset, sample_pairs
-from mmgsd.matching import Matcher, compute_entropy, fit_modes
-from mmgsd.metrics import aggregate, compute_query_errors
+from mmgsd.matching import Matcher, read_heatmap
+from mmgsd.metrics import aggregate, compute_mahalanobis2, compute_query_errors
+from mmgsd.mixture import Mixture
 from mmgsd.network import compute_cell_centres
 
-BASELINES = ("sift", "orb")
+BASELINES = list_baselines()  # hand-made descriptors that this OpenCV has
 CHANCE = ("centre", "random")
-BASELINE_STRIDE = 8  # px between the candidates that classical descriptors are compared at
 BANDWIDTHS = (1 / 64, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2)  # of a contrastive heatmap, in margins
 
-Answer = Callable[[int, int, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+TEMPERATURES = (0.1, 10.0)  # range in which the calibrated one is sought
+
+Answer = Callable[[int, int, np.ndarray, np.ndarray], tuple[Mixture, Tensor]]
 
 
 def evaluate_model(
     weights: Path, dataset: Path, config: EvaluateConfig, out: Path, *,
-    group: str = "", overwrite: bool = False, progress: bool = True,
+    group: str = "", temperature: float | None = None, overwrite: bool = False, progress: bool = True,
 ) -> Path:  # fmt: skip
     """Ask a trained model all queries and write the table ``out`` (Parquet).
 
     A table of the same weights, data set and configuration is returned as it is.
 
-    The true matches are those of ``group`` ("" is the object's own), whatever the model was taught.
+    The true matches are those of ``group`` ("" is the object's own), whatever the model was taught. ``temperature`` of
+    the heatmaps is the model's own, calibrated one unless given.
     """
     data = load_dataset(dataset, "test")
-    question = _describe_question(data, config, group, hashlib.sha256(Path(weights).read_bytes()).hexdigest())
+    method = hashlib.sha256(Path(weights).read_bytes()).hexdigest()
+    method += "" if temperature is None else f" at temperature {temperature:g}"
+    question = _describe_question(data, config, group, method)
     if _is_answered(out, question) and not overwrite:
         return out
-    answer = _model_answer(Matcher.load(weights), data)
+    matcher = Matcher.load(weights)
+    if temperature is not None:
+        matcher.temperature = temperature
+    answer = _model_answer(matcher, data)
     return _write(_ask(answer, data, config, group, progress, out.stem), out, question)
 
 
@@ -51,7 +60,7 @@ def evaluate_baseline(
     method: str, dataset: Path, config: EvaluateConfig, out: Path, *,
     group: str = "", overwrite: bool = False, progress: bool = True,
 ) -> Path:  # fmt: skip
-    """Ask ``sift``, ``orb``, or chance (``centre``, ``random``) the same queries; ValueError for another method."""
+    """Ask hand-made descriptors, or chance (``centre``, ``random``), the same queries; ValueError for others."""
     if method not in BASELINES + CHANCE:
         raise ValueError(f"method must be one of {BASELINES + CHANCE}, got {method!r}")
     data = load_dataset(dataset, "test")
@@ -63,7 +72,11 @@ def evaluate_baseline(
 
 
 def load_queries(path: Path) -> pd.DataFrame:
-    """One method's table: pair, image0, image1, point, visible, n, rmse_px, nearest_px, entropy, pck@…"""
+    """One method's table, a row a query.
+
+    pair, image0, image1, point; visible (source), n and hidden (true matches), rmse_px, nearest_px, best_px, pck@…,
+    entropy (nats), outside (share of the heatmap), mahalanobis2 (a list of n).
+    """
     return pd.read_parquet(path)
 
 
@@ -87,19 +100,47 @@ def write_results(results: dict, path: Path) -> Path:
 
 
 def calibrate_bandwidth(matcher: Matcher, data: Dataset, *, pairs: int = 16, points: int = 40, seed: int = 0) -> float:
-    """The heatmap bandwidth with the least mean error on training pairs: contrastive descriptors have no scale.
+    """The heatmap bandwidth with the least mean error on ``data``: contrastive descriptors have no scale.
 
     Leaves it set on the matcher and returns it (descriptor units).
     """
     config, errors = EvaluateConfig(pairs=pairs, points=points, seed=seed), {}
-    images = np.unique(sample_pairs(data.episode, pairs, np.random.default_rng(seed)))
-    descriptors = _describe(matcher, data, images)
+    answer = _model_answer(matcher, data)
     for bandwidth in (matcher.config.margin * b for b in BANDWIDTHS):
         matcher.bandwidth = bandwidth
-        queries = _ask(_model_answer(matcher, data, descriptors), data, config, matcher.config.group, False, "")
+        queries = _ask(answer, data, config, matcher.config.group, False, "")
         errors[bandwidth] = queries.rmse_px[queries.visible].mean()
     matcher.bandwidth = min(errors, key=errors.get)
     return matcher.bandwidth
+
+
+def calibrate_temperature(
+    matcher: Matcher, data: Dataset, *, pairs: int = 64, points: int = 40, seed: int = 0
+) -> float:
+    """The temperature with the least negative log-likelihood of the true matches on ``data`` (Guo et al., ICML 2017).
+
+    ``data`` must not have been trained on. Leaves it set on the matcher and returns it.
+    """
+    chosen = sample_pairs(data.episode, pairs, np.random.default_rng(seed))
+    descriptors, points = _describe(matcher, data, np.unique(chosen)), choose_points(points)
+    orbits = data.group(matcher.config.group).permutations[:, points].T  # (S, G)
+
+    def measure(log_temperature: float) -> float:
+        matcher.temperature, losses = float(np.exp(log_temperature)), []
+        for first, second in chosen:
+            asked = data.visible[first, points]
+            xy = torch.from_numpy(data.xy[first, points[asked]])
+            heatmap = matcher.compute_heatmaps(descriptors[first], descriptors[second], xy, data.size)
+            scale = np.array(heatmap.shape[:0:-1]) / data.size  # cells a px
+            cell = ((data.xy[second][orbits[asked]] + 0.5) * scale).astype(int)  # (S, G, 2)
+            cell = torch.from_numpy(cell.clip(0, np.array(heatmap.shape[:0:-1]) - 1)).to(heatmap.device)
+            mass = heatmap[torch.arange(len(xy), device=heatmap.device)[:, None], cell[..., 1], cell[..., 0]]
+            losses.append(-mass.clamp(min=1e-12).log().mean(1))
+        return float(torch.cat(losses).mean())
+
+    best = minimize_scalar(measure, bounds=np.log(TEMPERATURES), method="bounded", options={"xatol": 0.01})
+    matcher.temperature = float(np.exp(best.x))
+    return matcher.temperature
 
 
 def choose_points(count: int) -> np.ndarray:
@@ -115,24 +156,30 @@ def _ask(answer: Answer, data: Dataset, config: EvaluateConfig, group: str, prog
     count = np.array([len(o) for o in orbits])
     frames = []
     for pair, (first, second) in enumerate(tqdm(pairs, desc=f"evaluate {name}", disable=not progress, leave=False)):
-        modes, entropy = answer(first, second, data.xy[first, points], count)
+        fit, entropy = answer(first, second, data.xy[first, points], count)
         frame = pd.DataFrame({"pair": pair, "image0": first, "image1": second, "point": points})
-        frame = frame.assign(visible=data.visible[first, points], n=count, entropy=entropy)
+        frame = frame.assign(visible=data.visible[first, points], n=count, entropy=entropy.cpu().numpy())
+        hidden = [int((~data.visible[second, o]).sum()) for o in orbits]
+        frame = frame.assign(hidden=hidden, outside=fit.outside.cpu().numpy())
+        modes, covariances = (t.double().cpu().numpy() for t in (fit.modes, fit.covariances))
+        frame["mahalanobis2"] = None
         for n in np.unique(count):
             rows = np.flatnonzero(count == n)
-            true = data.xy[second][np.stack([orbits[r] for r in rows])]
-            for column, values in compute_query_errors(modes[rows, :n], true).items():
+            true = data.xy[second][np.stack([orbits[r] for r in rows])].astype(float)
+            for column, values in compute_query_errors(modes[rows, :n], covariances[rows, :n], true).items():
                 frame.loc[rows, column] = values
+            distances = compute_mahalanobis2(modes[rows, :n], covariances[rows, :n], true)
+            frame.loc[rows, "mahalanobis2"] = pd.Series(list(distances.astype(np.float32)), rows)
         frames.append(frame)
     return pd.concat(frames, ignore_index=True)
 
 
-def _model_answer(matcher: Matcher, data: Dataset, descriptors: dict[int, Tensor] | None = None) -> Answer:
-    descriptors = _describe(matcher, data, np.arange(len(data))) if descriptors is None else descriptors
+def _model_answer(matcher: Matcher, data: Dataset) -> Answer:
+    descriptors = _describe(matcher, data, np.arange(len(data)))
 
-    def answer(first: int, second: int, xy: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def answer(first: int, second: int, xy: np.ndarray, n: np.ndarray) -> tuple[Mixture, Tensor]:
         heatmap = matcher.compute_heatmaps(descriptors[first], descriptors[second], torch.from_numpy(xy), data.size)
-        return _fit(heatmap, n, compute_cell_centres(data.size, heatmap.shape[-2:]))
+        return read_heatmap(heatmap, torch.from_numpy(n), compute_cell_centres(data.size, heatmap.shape[-2:]))
 
     return answer
 
@@ -140,13 +187,11 @@ def _model_answer(matcher: Matcher, data: Dataset, descriptors: dict[int, Tensor
 def _classical_answer(method: str, data: Dataset) -> Answer:
     images = [data.load_image(i) for i in range(len(data))]
     masks = [data.load_mask(i) for i in range(len(data))]
+    matcher = BaselineMatcher(method)
 
-    def answer(first: int, second: int, xy: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        heatmap, grid = compute_baseline_heatmap(
-            images[first], images[second], xy, masks[second], method=method, stride=BASELINE_STRIDE
-        )
-        xs, ys = grid[0, :, 0], grid[:, 0, 1]
-        return _fit(torch.from_numpy(heatmap), n, (torch.from_numpy(xs), torch.from_numpy(ys)))
+    def answer(first: int, second: int, xy: np.ndarray, n: np.ndarray) -> tuple[Mixture, Tensor]:
+        heatmap, centres = matcher.compute_heatmaps(images[first], images[second], xy, masks[second])
+        return read_heatmap(heatmap, torch.from_numpy(n), centres)
 
     return answer
 
@@ -156,20 +201,15 @@ def _chance_answer(method: str, data: Dataset) -> Answer:
     pixels = [np.argwhere(data.load_mask(i))[:, ::-1].astype(float) for i in range(len(data))]
     rng = np.random.default_rng(0)
 
-    def answer(first: int, second: int, xy: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def answer(first: int, second: int, xy: np.ndarray, n: np.ndarray) -> tuple[Mixture, Tensor]:
         shape, on_object = (len(xy), n.max()), pixels[second]
         centre = np.broadcast_to(on_object.mean(0), (*shape, 2))
         modes = centre if method == "centre" else on_object[rng.integers(len(on_object), size=shape)]
-        return modes, np.full(len(xy), np.log(len(on_object)))
+        unknown = torch.full((*shape, 2, 2), torch.nan)
+        fit = Mixture(torch.tensor(modes), torch.ones(shape) / shape[1], unknown, unknown[:, 0, 0, 0])
+        return fit, torch.full((len(xy),), float(np.log(len(on_object))))
 
     return answer
-
-
-def _fit(heatmap: Tensor, n: np.ndarray, cells: tuple[Tensor, Tensor]) -> tuple[np.ndarray, np.ndarray]:
-    xs, ys = (c.float().to(heatmap.device) for c in cells)
-    fit = fit_modes(heatmap, torch.from_numpy(n).to(heatmap.device), xs, ys)
-    entropy = compute_entropy(heatmap.flatten(1), float((xs[1] - xs[0]) * (ys[1] - ys[0])))
-    return fit.modes.cpu().numpy(), entropy.cpu().numpy()
 
 
 def _describe(matcher: Matcher, data: Dataset, indices: np.ndarray, *, batch: int = 16) -> dict[int, Tensor]:

@@ -1,4 +1,4 @@
-"""From descriptors to heatmaps, modes with weights and covariances, and entropy; the public ``Matcher``."""
+"""From descriptors to heatmaps, their modes and entropy; the public ``Matcher`` and its answer, the ``Match``."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
-from torch.nn import functional as F
 
 from mmgsd.config import TrainConfig, from_dict
 from mmgsd.losses import CONTRASTIVE, compute_squared_distances
+from mmgsd.mixture import Mixture, fit_modes
 from mmgsd.network import (
     build_network,
     compute_cell_centres,
@@ -24,30 +24,18 @@ from mmgsd.network import (
     sample_descriptors,
 )
 
-CELLS = 256  # the strongest cells of a heatmap, which the mixture is fitted to
-ITERATIONS = 15  # of expectation-maximisation
-KERNEL_CELLS = 3.0  # std of the kernel that finds the initial peaks, in cells
-PRIOR_MASS = 0.05  # mass that each component holds a priori: symmetric modes are equally likely
-MIN_STD_CELLS = 0.4  # a component is never narrower: half a cell's own extent
+RADIUS_PX = 20.0  # within which a robot's grasp still holds, unless the caller says otherwise
 
 
-@dataclass(frozen=True)
-class Mixture:
-    """n-modal Gaussian fits of S heatmaps, most probable mode first; absent modes have weight 0 and NaN elsewhere."""
-
-    modes: Tensor  # (S, N, 2) px
-    weights: Tensor  # (S, N), sum to 1
-    covariances: Tensor  # (S, N, 2, 2) px²
-
-
-def compute_heatmap(squared_distances: Tensor, *, bandwidth: float | None = None) -> Tensor:
+def compute_heatmap(squared_distances: Tensor, *, bandwidth: float | None = None, temperature: float = 1.0) -> Tensor:
     """Distributions over cells (..., C) from squared descriptor distances (..., C).
 
     softmax(-d²) as in training (paper section "Symmetric Distributional Loss"); or, for descriptors of a contrastive
     loss, which have no scale of their own, a Gaussian of ``bandwidth`` in the descriptor norm differences, normalised.
+    Either is raised to the power 1 / ``temperature``.
     """
     scale = 1.0 if bandwidth is None else 1 / (2 * bandwidth**2)
-    return torch.softmax(-scale * squared_distances, -1)
+    return torch.softmax(-scale / temperature * squared_distances, -1)
 
 
 def compute_entropy(heatmap: Tensor, cell_area: float) -> Tensor:
@@ -55,93 +43,13 @@ def compute_entropy(heatmap: Tensor, cell_area: float) -> Tensor:
     return torch.special.entr(heatmap).sum(-1) + float(np.log(cell_area))
 
 
-def fit_modes(heatmap: Tensor, n: int | Tensor, xs: Tensor, ys: Tensor, *, iterations: int = ITERATIONS) -> Mixture:
-    """Fit an n-modal Gaussian mixture to each heatmap by weighted expectation-maximisation.
+@dataclass(frozen=True)
+class Best:
+    """The one mode of each of S queries to act on; NaN where the answer is not sure enough."""
 
-    ``heatmap`` (S, h, w) not negative, ``n`` modes for all or (S,), ``xs`` (w,) and ``ys`` (h,) cell centres in px.
-    Starts from separated peaks that each account for 1 / n of the mass. ValueError for other shapes or n < 1.
-    """
-    if heatmap.ndim != 3 or heatmap.shape[1:] != (len(ys), len(xs)):
-        raise ValueError(f"heatmap must have shape (S, {len(ys)}, {len(xs)}), got {tuple(heatmap.shape)}")
-    n = torch.as_tensor(n, device=heatmap.device)
-    if n.ndim and n.shape != heatmap.shape[:1]:
-        raise ValueError(f"n must be one number or of shape ({len(heatmap)},), got shape {tuple(n.shape)}")
-    if n.numel() and int(n.min()) < 1:
-        raise ValueError(f"n must be at least 1, got {int(n.min())}")
-    n_max = int(n.max()) if n.numel() else 1
-    n, heatmap = n.expand(len(heatmap)), heatmap.float()
-    step = torch.stack([xs[1] - xs[0], ys[1] - ys[0]])  # px a cell
-    total = heatmap.flatten(1).sum(-1, keepdim=True)
-    uniform = torch.full_like(heatmap.flatten(1), 1 / heatmap[0].numel()) if len(n) else heatmap.flatten(1)
-    mass = torch.where(total > 0, heatmap.flatten(1) / total.clamp(min=1e-30), uniform)
-    present = torch.arange(n_max, device=n.device) < n[:, None]  # (S, N)
-    start = _find_peaks(mass.view_as(heatmap), n, n_max)  # (S, N, 2) cells
-    # in units of cells all through, so that one regularisation suits every image size
-    mass, cell = mass.topk(min(CELLS, mass.shape[1]), dim=-1)
-    mass = mass / mass.sum(-1, keepdim=True)
-    position = torch.stack([cell % len(xs), cell // len(xs)], -1).float()  # (S, C, 2)
-    means, weights, covariances = _run_em(mass, position, start, present, iterations)
-    order = weights.argsort(-1, descending=True)
-    means = means.gather(1, order[..., None].expand_as(means))
-    covariances = covariances.gather(1, order[..., None, None].expand_as(covariances))
-    absent = ~present.gather(1, order)
-    modes = (means * step + torch.stack([xs[0], ys[0]])).masked_fill(absent[..., None], torch.nan)
-    covariances = (covariances * step[:, None] * step).masked_fill(absent[..., None, None], torch.nan)
-    return Mixture(modes, weights.gather(1, order), covariances)
-
-
-def _find_peaks(mass: Tensor, n: Tensor, n_max: int) -> Tensor:
-    """Cells (S, N, 2) of peaks found one after another, each taking up to 1 / n of the mass around it away."""
-    size = len(mass), *mass.shape[1:]
-    reach = torch.arange(-int(3 * KERNEL_CELLS), int(3 * KERNEL_CELLS) + 1, device=mass.device)
-    kernel = torch.exp(-0.5 * (reach / KERNEL_CELLS) ** 2)
-    rows, columns = (torch.arange(k, device=mass.device) for k in size[1:])
-    peaks, rest = [], mass
-    for _ in range(n_max):
-        local = F.conv2d(rest[:, None], kernel.view(1, 1, 1, -1), padding=(0, len(reach) // 2))
-        local = F.conv2d(local, kernel.view(1, 1, -1, 1), padding=(len(reach) // 2, 0))[:, 0]
-        # the blurred mass finds the region, the mass itself the peak inside it
-        share, index = (local * (rest + 1e-3 * local)).flatten(1).max(-1)
-        share = local.flatten(1).gather(1, index[:, None])
-        row, column = index // size[2], index % size[2]
-        near = torch.exp(-0.5 * ((rows - row[:, None]) / KERNEL_CELLS) ** 2)[:, :, None] * torch.exp(
-            -0.5 * ((columns - column[:, None]) / KERNEL_CELLS) ** 2
-        ).unsqueeze(1)
-        taken = (1 / (n[:, None] * share.clamp(min=1e-12))).clamp(max=1)  # (S, 1)
-        rest = rest * (1 - taken[..., None] * near)
-        peaks.append(torch.stack([column, row], -1))
-    return torch.stack(peaks, 1).float()
-
-
-def _run_em(
-    mass: Tensor, position: Tensor, means: Tensor, present: Tensor, iterations: int
-) -> tuple[Tensor, Tensor, Tensor]:
-    """EM on (S, C) mass at (S, C, 2) positions; returns means (S, N, 2), weights (S, N), covariances (S, N, 2, 2)."""
-    floor = MIN_STD_CELLS**2
-    weights = present / present.sum(-1, keepdim=True)
-    a = c = torch.full_like(weights, KERNEL_CELLS**2)  # covariance [[a, b], [b, c]]
-    b = torch.zeros_like(a)
-    x, y = position[..., 0, None], position[..., 1, None]  # (S, C, 1)
-    for _ in range(iterations):
-        dx, dy = x - means[:, None, :, 0], y - means[:, None, :, 1]  # (S, C, N)
-        determinant = a * c - b * b
-        log_scale = weights.clamp(min=1e-12).log() - 0.5 * determinant.log()
-        quadratic = (c / determinant)[:, None] * dx * dx + (a / determinant)[:, None] * dy * dy
-        quadratic = quadratic - 2 * (b / determinant)[:, None] * dx * dy
-        score = (log_scale[:, None] - 0.5 * quadratic).masked_fill(~present[:, None], -torch.inf)
-        share = torch.softmax(score, -1) * mass[..., None]  # (S, C, N)
-        count = share.sum(1)  # (S, N)
-        safe = count.clamp(min=1e-9)
-        update = torch.stack([(share * x).sum(1), (share * y).sum(1)], -1) / safe[..., None]
-        means = torch.where(count[..., None] > 1e-9, update, means)
-        dx, dy = x - means[:, None, :, 0], y - means[:, None, :, 1]
-        a = (share * dx * dx).sum(1) / safe + floor
-        c = (share * dy * dy).sum(1) / safe + floor
-        b = (share * dx * dy).sum(1) / safe
-        weights = (count + PRIOR_MASS) * present
-        weights = weights / weights.sum(-1, keepdim=True)
-    covariances = torch.stack([torch.stack([a, b], -1), torch.stack([b, c], -1)], -2)
-    return means, weights, covariances
+    xy: np.ndarray  # (S, 2) px in image1
+    spread_px: np.ndarray  # (S,) std of the mode, root mean square over directions
+    confidence: np.ndarray  # (S,) in [0, 1]
 
 
 @dataclass(frozen=True)
@@ -155,6 +63,7 @@ class Match:
     weights: np.ndarray  # (S, n), sum to 1
     covariances: np.ndarray  # (S, n, 2, 2) px²
     entropy: np.ndarray  # (S,) nats, of the density over px
+    outside: np.ndarray  # (S,) heatmap mass outside every mode's 95 % ellipse, in [0, 1]
     cells: np.ndarray  # (S, h, w) heatmap on the descriptors' grid, sums to 1
 
     @cached_property
@@ -165,6 +74,35 @@ class Match:
         for cells, pixels in zip(self.cells, full, strict=True):
             cv2.resize(cells, size, dst=pixels, interpolation=cv2.INTER_LINEAR)
         return full / full.sum((1, 2), keepdims=True)
+
+    @property
+    def spread_px(self) -> np.ndarray:
+        """(S, n) std of each mode, root mean square over directions; NaN for absent modes."""
+        return np.sqrt(np.trace(self.covariances, axis1=-2, axis2=-1) / 2)
+
+    def confidence(self, *, radius_px: float = RADIUS_PX) -> np.ndarray:
+        """(S, n) in [0, 1], probability that a true match lies within ``radius_px`` of each mode.
+
+        That of a round Gaussian as wide as the mode, less what the mode's weight lacks of an equal share.
+        """
+        if not radius_px > 0:
+            raise ValueError(f"radius_px must be greater than 0 px, got {radius_px!r}")
+        present = (self.weights > 0).sum(1, keepdims=True)
+        near = -np.expm1(-0.5 * np.square(radius_px / self.spread_px))
+        return np.minimum(1, present * self.weights) * np.nan_to_num(near)
+
+    def best(self, *, min_confidence: float = 0.0, radius_px: float = RADIUS_PX) -> Best:
+        """The mode with the least spread of each query: which of the like places to grasp (paper introduction).
+
+        Abstains, with NaN for ``xy``, where a true match lies within ``radius_px`` with less than ``min_confidence``.
+        """
+        if not 0 <= min_confidence <= 1:
+            raise ValueError(f"min_confidence must be in [0, 1], got {min_confidence!r}")
+        rows = np.arange(len(self.modes))
+        chosen = np.nan_to_num(self.spread_px, nan=np.inf).argmin(1)
+        confidence = self.confidence(radius_px=radius_px)[rows, chosen]
+        xy = np.where((confidence >= min_confidence)[:, None], self.modes[rows, chosen], np.nan)
+        return Best(xy, self.spread_px[rows, chosen], confidence)
 
     def plot(self, index: int = 0):  # noqa: ANN201 (matplotlib is imported only where a plot is asked for)
         """Figure of source pixel, heatmap and modes with their 1-std ellipses, for one query."""
@@ -178,11 +116,12 @@ class Matcher:
 
     def __init__(
         self, network: torch.nn.Module, config: TrainConfig, *, modes: int, size: tuple[int, int], device: str = "",
-        bandwidth: float | None = None,
+        bandwidth: float | None = None, temperature: float = 1.0,
     ) -> None:  # fmt: skip
         self.device = torch.device(device or find_device())
         self.network = network.eval().to(self.device, memory_format=torch.channels_last)
         self.config, self.modes, self.size = config, modes, size
+        self.temperature = temperature
         self.bandwidth = config.margin / 4 if bandwidth is None and config.method in CONTRASTIVE else bandwidth
 
     @classmethod
@@ -205,8 +144,8 @@ class Matcher:
         except RuntimeError as error:
             raise ValueError(f"{path} does not fit the network {config.network!r}: {error}") from error
         size = tuple(json.loads(metadata["size"]))
-        bandwidth = float(metadata["bandwidth"]) if "bandwidth" in metadata else None
-        return cls(network, config, modes=int(metadata["modes"]), size=size, device=device, bandwidth=bandwidth)
+        scales = {name: float(metadata[name]) for name in ("bandwidth", "temperature") if name in metadata}
+        return cls(network, config, modes=int(metadata["modes"]), size=size, device=device, **scales)
 
     @torch.inference_mode()
     def describe(self, images: list[np.ndarray]) -> Tensor:
@@ -221,25 +160,49 @@ class Matcher:
         """Heatmaps (S, h, w) of source px ``xy`` (S, 2) of an image of ``size``, from (D, h, w) descriptors."""
         source = sample_descriptors(descriptors0[None], xy[None].to(self.device), size)  # (1, S, D)
         squared = compute_squared_distances(source, descriptors1.flatten(1).T[None])[0]  # (S, C)
-        return compute_heatmap(squared, bandwidth=self.bandwidth).view(len(xy), *descriptors1.shape[1:])
+        heatmap = compute_heatmap(squared, bandwidth=self.bandwidth, temperature=self.temperature)
+        return heatmap.view(len(xy), *descriptors1.shape[1:])
 
     @torch.inference_mode()
-    def match(self, image0: np.ndarray, image1: np.ndarray, xy: np.ndarray | list, *, n: int | None = None) -> Match:
+    def match(
+        self, image0: np.ndarray, image1: np.ndarray, xy: np.ndarray | list, *, n: int | str | None = None
+    ) -> Match:
         """All matches in ``image1`` of the pixels ``xy`` (S, 2) of ``image0``.
 
         Images are (H, W, 3), (H, W, 4) or (H, W), uint8 or float in [0, 1]. ``n`` modes are fitted, by default as many
-        as the symmetry group has members. ValueError for other images, or for ``xy`` outside image0.
+        as the symmetry group has members; "auto" finds their number. ValueError for other images, or for ``xy``
+        outside image0.
         """
-        image0, image1 = to_rgb(image0, "image0"), to_rgb(image1, "image1")
+        image0, image1, points = check_question(image0, image1, xy)
         size0, size1 = ((im.shape[1], im.shape[0]) for im in (image0, image1))
-        points = _check_xy(xy, size0)
         descriptors = self.describe([image0, image1])
         cells = self.compute_heatmaps(descriptors[0], descriptors[1], torch.from_numpy(points), size0)
-        xs, ys = (c.to(self.device) for c in compute_cell_centres(size1, cells.shape[-2:]))
-        fit = fit_modes(cells, self.modes if n is None else n, xs, ys)
-        entropy = compute_entropy(cells.flatten(1), float((xs[1] - xs[0]) * (ys[1] - ys[0])))
-        arrays = (t.cpu().numpy() for t in (fit.modes, fit.weights, fit.covariances, entropy, cells))
-        return Match(image0, image1, points, *arrays)
+        centres = compute_cell_centres(size1, cells.shape[-2:])
+        return make_match(image0, image1, points, cells, centres, self.modes if n is None else n)
+
+
+def make_match(
+    image0: np.ndarray, image1: np.ndarray, xy: np.ndarray, cells: Tensor, centres: tuple[Tensor, Tensor], n: int | str
+) -> Match:
+    """The answer that heatmaps (S, h, w) with cell ``centres`` (w,), (h,) px hold, however they were made."""
+    fit, entropy = read_heatmap(cells, n, centres)
+    arrays = (t.cpu().numpy() for t in (fit.modes, fit.weights, fit.covariances, entropy, fit.outside, cells))
+    return Match(image0, image1, xy, *arrays)
+
+
+def read_heatmap(heatmap: Tensor, n: int | str | Tensor, centres: tuple[Tensor, Tensor]) -> tuple[Mixture, Tensor]:
+    """Mixtures of ``n`` modes and entropies (S,) in nats of heatmaps (S, h, w) with cell ``centres`` (w,), (h,) px."""
+    xs, ys = (c.float().to(heatmap.device) for c in centres)
+    entropy = compute_entropy(heatmap.flatten(1), float((xs[1] - xs[0]) * (ys[1] - ys[0])))
+    return fit_modes(heatmap, n, xs, ys), entropy
+
+
+def check_question(
+    image0: np.ndarray, image1: np.ndarray, xy: np.ndarray | list
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Both images as (H, W, 3) uint8 and the pixels as (S, 2) float32; ValueError names the argument that is wrong."""
+    image0, image1 = to_rgb(image0, "image0"), to_rgb(image1, "image1")
+    return image0, image1, _check_xy(xy, (image0.shape[1], image0.shape[0]))
 
 
 def to_rgb(image: np.ndarray, name: str = "image") -> np.ndarray:

@@ -23,8 +23,8 @@ from tqdm.auto import tqdm
 from mmgsd import losses
 from mmgsd.augmentation import Batch, load_training_images, make_batch
 from mmgsd.config import TrainConfig
-from mmgsd.dataset import Dataset, load_dataset
-from mmgsd.evaluation import calibrate_bandwidth
+from mmgsd.dataset import Dataset, hold_out, load_dataset
+from mmgsd.evaluation import calibrate_bandwidth, calibrate_temperature
 from mmgsd.losses import CONTRASTIVE, MATCHES_OF_ONE
 from mmgsd.matching import Matcher
 from mmgsd.network import (
@@ -115,19 +115,20 @@ class _Run:
     """A training run that can be killed between any two steps."""
 
     def __init__(self, config: TrainConfig, data: Dataset, folder: Path, device: torch.device) -> None:
-        self.config, self.data, self.folder = config, data, folder
+        self.config, self.folder = config, folder
+        self.data, self.held_out = hold_out(data)  # the latter for calibration
         self.device, self.size = device, data.size
         group = data.group(config.group)
         known = group.permutations[:1] if config.method in MATCHES_OF_ONE else group.permutations
         self.permutations = torch.tensor(known, device=device)
-        self.images = load_training_images(data, config.input_px)
+        self.images = load_training_images(self.data, config.input_px)
         torch.manual_seed(config.seed)
         network = build_network(config.network, config.descriptor_dim, trunk_weights=config.trunk_weights).to(device)
         self.network = network.to(memory_format=torch.channels_last)
         # the average of the last steps' weights, statistics of batch normalisation included, is what is kept
         average = get_ema_multi_avg_fn(1 - 1 / max(2.0, config.steps / 50))
         self.average = AveragedModel(self.network, multi_avg_fn=average, use_buffers=True)
-        start = make_prototypes(data.xy, known, config.descriptor_dim, math.hypot(*data.size))
+        start = make_prototypes(self.data.xy, known, config.descriptor_dim, math.hypot(*data.size))
         self.prototypes = torch.nn.Parameter(start.to(device))
         parameters = [*self.network.parameters(), self.prototypes]
         self.optimiser = torch.optim.AdamW(parameters, lr=config.learning_rate, weight_decay=config.weight_decay)
@@ -225,9 +226,10 @@ class _Run:
             "seconds": f"{self.seconds:.1f}",
             "hardware": _name_hardware(self.device),
         }
+        matcher = Matcher(self.average.module, self.config, modes=modes, size=self.size, device=self.device.type)
         if self.config.method in CONTRASTIVE:
-            matcher = Matcher(self.average.module, self.config, modes=modes, size=self.size, device=self.device.type)
-            metadata["bandwidth"] = repr(calibrate_bandwidth(matcher, self.data))
+            metadata["bandwidth"] = repr(calibrate_bandwidth(matcher, self.held_out))
+        metadata["temperature"] = repr(calibrate_temperature(matcher, self.held_out))
         state = {name: value.contiguous() for name, value in self.average.module.state_dict().items()}
         aside = weights.with_suffix(".tmp")
         save_file(state, aside, metadata)

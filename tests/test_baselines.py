@@ -6,11 +6,13 @@ import pytest
 
 from mmgsd.baselines import (
     BASELINES,
+    BaselineMatcher,
     compute_baseline_heatmap,
     compute_descriptors,
     compute_distances,
     compute_grid,
     compute_orientations,
+    list_baselines,
 )
 
 HERE = BASELINES[:-1]  # SURF is not in every OpenCV
@@ -166,3 +168,29 @@ def test_bad_arguments_are_named(change, message, image, mask, xy):
     method, stride = arguments.pop("method"), arguments.pop("stride", 8)
     with pytest.raises(ValueError, match=message):
         compute_baseline_heatmap(**arguments, method=method, stride=stride)
+
+
+@pytest.mark.parametrize("method", HERE)
+def test_a_baseline_answers_as_a_matcher_does(method, image, mask):
+    match = BaselineMatcher(method, modes=4).match(image, image, [(100, 90), (130.5, 110)], mask1=mask)
+    assert (match.modes.shape, match.covariances.shape, match.heatmap.shape) == ((2, 4, 2), (2, 4, 2, 2), (2, 200, 240))
+    assert np.linalg.norm(match.modes - match.xy[:, None], axis=-1).min(1).max() < 16
+    assert match.best().xy.shape == (2, 2)
+
+
+def test_a_baseline_takes_images_as_a_matcher_does(image):
+    grey = image[..., 0].astype(np.float32) / 255
+    match = BaselineMatcher("sift").match(grey, np.dstack([image, image[..., :1]]), [], n="auto")
+    assert (match.image0.shape, match.image1.shape, len(match.modes)) == ((200, 240, 3), (200, 240, 3), 0)
+
+
+def test_an_unknown_baseline():
+    with pytest.raises(ValueError, match="method must be one of 'sift'.*got 'lift'"):
+        BaselineMatcher("lift")
+
+
+def test_surf_is_listed_where_opencv_has_it(monkeypatch):
+    monkeypatch.delattr(cv2, "xfeatures2d", raising=False)
+    assert list_baselines() == HERE
+    monkeypatch.setattr(cv2, "xfeatures2d", SimpleNamespace(SURF_create=cv2.SIFT_create), raising=False)
+    assert list_baselines() == BASELINES

@@ -15,6 +15,7 @@ from mmgsd.dataset import (
     check_dataset,
     encode_image,
     encode_mask,
+    hold_out,
     load_dataset,
     measure_images,
     sample_pairs,
@@ -200,3 +201,17 @@ def test_measured_images_are_those_of_the_pixels(cloth_dataset: Path) -> None:
     np.testing.assert_array_equal(table.background_colour[2], np.median(image[~mask], 0))
     assert table.visible.to_list() == [1.0] * len(data)
     assert set(table.state) == {"flat"}
+
+
+def test_last_simulations_are_held_out(tiny_dataset: Callable[..., Path]) -> None:
+    data = load_dataset(tiny_dataset(n_train=6))
+    kept, held = hold_out(data)
+    assert (kept.episode.tolist(), held.episode.tolist()) == ([0, 0, 1, 1], [2, 2])
+    np.testing.assert_array_equal(held.xy, data.xy[4:])
+    np.testing.assert_array_equal(held.load_image(1), data.load_image(5))
+    assert [len(part) for part in hold_out(data, share=0.7)] == [2, 4]
+
+
+def test_one_simulation_cannot_be_held_out(tiny_dataset: Callable[..., Path]) -> None:
+    data = load_dataset(tiny_dataset(n_train=2))
+    assert [len(part) for part in hold_out(data)] == [2, 2]

@@ -16,7 +16,9 @@ from mmgsd.config import EvaluateConfig, TrainConfig
 from mmgsd.dataset import Dataset, load_dataset
 from mmgsd.evaluation import (
     BANDWIDTHS,
+    BASELINES,
     calibrate_bandwidth,
+    calibrate_temperature,
     choose_points,
     evaluate_baseline,
     evaluate_model,
@@ -25,7 +27,8 @@ from mmgsd.evaluation import (
     write_results,
 )
 from mmgsd.matching import Matcher
-from mmgsd.network import build_network
+from mmgsd.mixture import Mixture
+from mmgsd.network import build_network, compute_cell_centres
 
 CONFIG = EvaluateConfig(pairs=3, points=5)
 CLOTH_SIDE_PX = 240.0  # of the synthetic cloths
@@ -46,11 +49,13 @@ def answer_with_the_truth(group: str, shift: float) -> object:
     """Stands for a model that knows the labels: the true modes, moved by ``shift`` px along x."""
 
     def make(matcher: object, data: Dataset) -> evaluation.Answer:
-        def answer(first: int, second: int, xy: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        def answer(first: int, second: int, xy: np.ndarray, n: np.ndarray) -> tuple[Mixture, torch.Tensor]:
             modes = np.full((len(xy), n.max(), 2), np.nan)
             for row, point in enumerate(choose_points(CONFIG.points)):
                 modes[row, : n[row]] = data.xy[second, data.group(group).distinct_modes(point)[::-1]] + [shift, 0]
-            return modes, np.zeros(len(xy))
+            covariances = torch.eye(2).repeat(*modes.shape[:2], 1, 1)
+            nothing = torch.zeros(len(xy))
+            return Mixture(torch.from_numpy(modes), torch.ones(modes.shape[:2]), covariances, nothing), nothing
 
         return answer
 
@@ -79,7 +84,9 @@ def test_the_truth_has_no_error(ask_oracle: object, group: str) -> None:
 
 def test_a_shifted_truth_is_wrong_by_the_shift(ask_oracle: object) -> None:
     queries = ask_oracle(shift=3.0)
-    np.testing.assert_allclose(queries[["rmse_px", "nearest_px"]], 3.0, rtol=1e-5)
+    np.testing.assert_allclose(queries[["rmse_px", "nearest_px", "best_px"]], 3.0, rtol=1e-5)
+    np.testing.assert_allclose(np.concatenate(queries.mahalanobis2), 9.0, rtol=1e-5)
+    assert queries.mahalanobis2.map(len).equals(queries.n)
 
 
 def test_coinciding_modes_are_merged(ask_oracle: object) -> None:
@@ -90,12 +97,15 @@ def test_coinciding_modes_are_merged(ask_oracle: object) -> None:
 def test_one_row_a_query(cloth_dataset: Path, tmp_path: Path) -> None:
     queries = ask_baseline("centre", cloth_dataset, tmp_path / "centre.parquet")
     assert list(queries.columns) == [
-        "pair", "image0", "image1", "point", "visible", "n", "entropy", "rmse_px", "nearest_px",
-        "pck@5px", "pck@10px", "pck@20px",
+        "pair", "image0", "image1", "point", "visible", "n", "entropy", "hidden", "outside", "mahalanobis2",
+        "rmse_px", "nearest_px", "best_px", "pck@5px", "pck@10px", "pck@20px",
     ]  # fmt: skip
     assert len(queries) == CONFIG.pairs * CONFIG.points
     assert not queries.duplicated(["pair", "point"]).any()
-    assert np.isfinite(queries.drop(columns="visible").to_numpy(dtype=float)).all()
+    unknown = ["visible", "outside", "mahalanobis2"]  # chance has no heatmap
+    assert np.isfinite(queries.drop(columns=unknown).to_numpy(dtype=float)).all()
+    assert queries.outside.isna().all()
+    assert np.isnan(np.concatenate(queries.mahalanobis2)).all()
 
 
 def test_pairs_show_different_simulations(cloth_dataset: Path, tmp_path: Path) -> None:
@@ -118,16 +128,27 @@ def test_the_centres_error_on_a_flat_square(cloth_dataset: Path, tmp_path: Path)
     assert queries[312].tolist() == pytest.approx([0] * 3, abs=1)
 
 
-@pytest.mark.parametrize("method", ["sift", "orb"])
+@pytest.mark.parametrize("method", BASELINES)
 def test_classical_descriptors_answer(cloth_dataset: Path, tmp_path: Path, method: str) -> None:
     config = EvaluateConfig(pairs=1, points=3)
     queries = ask_baseline(method, cloth_dataset, tmp_path / f"{method}.parquet", config)
     assert len(queries) == 3
     assert np.isfinite(queries.rmse_px).all()
+    assert queries.outside.between(0, 1).all()
+
+
+def test_hidden_matches_are_counted(cloth_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = load_dataset(cloth_dataset, "test")
+    visible = data.visible.copy()
+    visible[:, [0, 24]] = False  # two of the four corners
+    monkeypatch.setitem(data.__dict__, "visible", visible)
+    monkeypatch.setattr(evaluation, "load_dataset", lambda *_: data)
+    queries = ask_baseline("centre", cloth_dataset, tmp_path / "centre.parquet")
+    assert queries[queries["pair"] == 0].hidden.tolist() == [2, 0, 0, 0, 2]
 
 
 def test_unknown_baseline(cloth_dataset: Path, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="method must be one of .*'sift', 'orb', 'centre', 'random'.*, got 'hog'"):
+    with pytest.raises(ValueError, match="method must be one of .*'sift', 'orb', .*'centre', 'random'.*, got 'hog'"):
         ask_baseline("hog", cloth_dataset, tmp_path / "hog.parquet")
 
 
@@ -180,7 +201,9 @@ def test_as_many_points_as_asked_for(count: int) -> None:
 
 def test_summary_separates_visible_sources(tmp_path: Path) -> None:
     shares = dict.fromkeys(["pck@5px", "pck@10px", "pck@20px"], 1.0)
-    table = pd.DataFrame({"visible": [True, True, False], "rmse_px": [1.0, 3.0, 8.0], "nearest_px": 1.0, **shares})
+    table = pd.DataFrame(
+        {"visible": [True, True, False], "rmse_px": [1.0, 3.0, 8.0], "nearest_px": 1.0, "best_px": 1.0, **shares}
+    )
     table.to_parquet(tmp_path / "mmgsd.parquet")
     summary = summarise({"mmgsd": tmp_path / "mmgsd.parquet"})["mmgsd"]
     assert (summary["rmse_mean"], summary["queries"]) == (2.0, 2)
@@ -201,6 +224,28 @@ def test_calibration_picks_a_candidate(cloth_dataset: Path, method: str) -> None
     bandwidth = calibrate_bandwidth(matcher, load_dataset(cloth_dataset), pairs=2, points=5)
     assert bandwidth == matcher.bandwidth
     assert bandwidth in [pytest.approx(0.6 * b) for b in BANDWIDTHS]
+
+
+def test_temperature_of_overconfident_and_timid_heatmaps(cloth_dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Heatmaps are Gaussians of 20 px around points that are off the truth by a Gaussian of another std."""
+    data, truth = load_dataset(cloth_dataset), {}
+    config = TrainConfig(input_px=64, descriptor_dim=4, group="identity")
+    matcher = Matcher(build_network("lite0", 4, pretrained=False), config, modes=1, size=(485, 485), device="cpu")
+    xs, ys = compute_cell_centres((485, 485), (97, 97))
+
+    def compute_heatmaps(first: None, second: int, xy: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
+        centre = torch.from_numpy(data.xy[second, choose_points(40)]) + truth["offset"]
+        squared = (xs[None, None] - centre[:, :1, None]) ** 2 + (ys[None, :, None] - centre[:, 1:, None]) ** 2
+        logits = -squared / (2 * 20.0**2) / matcher.temperature
+        return logits.flatten(1).softmax(-1).view(-1, 97, 97)
+
+    monkeypatch.setattr(matcher, "compute_heatmaps", compute_heatmaps)
+    monkeypatch.setattr(evaluation, "_describe", lambda matcher, data, images: {int(i): int(i) for i in images})
+    for std, temperature in ((10.0, 0.25), (20.0, 1.0), (40.0, 4.0)):
+        truth["offset"] = std * torch.randn(40, 2, generator=torch.Generator().manual_seed(0))
+        truth["offset"] *= std / truth["offset"].square().mean().sqrt()
+        assert calibrate_temperature(matcher, data, pairs=8) == pytest.approx(temperature, rel=0.05)
+        assert matcher.temperature == pytest.approx(temperature, rel=0.05)
 
 
 def test_a_model_answers_every_query(cloth_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""Matching: heatmaps, the mixture's fit on known mixtures, entropy, and the public Matcher's door."""
+"""Matching: heatmaps, entropy, the public Matcher's door and what its answer offers."""
 
 from __future__ import annotations
 
@@ -9,41 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from heatmaps import CELL_PX, CELLS, CORNERS, SIZE, draw_mixture, one_cell
 from safetensors.torch import save_file
-from sklearn.mixture import GaussianMixture
-from torch import Tensor
 
 from mmgsd.config import TrainConfig
-from mmgsd.matching import ITERATIONS, Matcher, compute_entropy, compute_heatmap, fit_modes
-from mmgsd.metrics import compute_mode_errors
+from mmgsd.matching import Match, Matcher, compute_entropy, compute_heatmap, make_match
 from mmgsd.network import build_network, compute_cell_centres
 
-SIZE, CELLS = (485, 485), 64
-CELL_PX = SIZE[0] / CELLS
-XS, YS = compute_cell_centres(SIZE, (CELLS, CELLS))
 CONFIG = TrainConfig(input_px=64, descriptor_dim=8)
-CORNERS = np.array([[100.3, 100.0], [380.0, 110.9], [375.2, 371.7], [105.5, 383.1]])
-
-
-def draw_mixture(modes: np.ndarray, std_px: float | np.ndarray, weights: np.ndarray | None = None) -> Tensor:
-    """Heatmap (1, 64, 64) of isotropic Gaussians at ``modes`` (N, 2) px."""
-    weights = np.ones(len(modes)) if weights is None else weights
-    std = np.broadcast_to(std_px, len(modes))
-    x, y = XS.numpy()[None, None, :], YS.numpy()[None, :, None]
-    squared = (x - modes[:, 0, None, None]) ** 2 + (y - modes[:, 1, None, None]) ** 2
-    density = np.exp(-squared / (2 * std[:, None, None] ** 2)) / std[:, None, None] ** 2
-    heatmap = (weights[:, None, None] * density).sum(0)
-    return torch.from_numpy(heatmap / heatmap.sum())[None].float()
-
-
-def one_cell(row: int, column: int) -> Tensor:
-    heatmap = torch.zeros(1, CELLS, CELLS)
-    heatmap[0, row, column] = 1
-    return heatmap
-
-
-def measure_errors(modes: np.ndarray, true: np.ndarray) -> np.ndarray:
-    return compute_mode_errors(np.asarray(modes, dtype=float)[None], true[None])[0]
 
 
 def test_heatmap_by_hand() -> None:
@@ -55,6 +28,13 @@ def test_contrastive_heatmap_is_a_gaussian_of_distance() -> None:
     distance = torch.tensor([[0.0, 0.1, 0.3]])
     expected = torch.exp(-(distance**2) / (2 * 0.1**2))
     torch.testing.assert_close(compute_heatmap(distance**2, bandwidth=0.1), expected / expected.sum())
+
+
+@pytest.mark.parametrize("bandwidth", [None, 0.2])
+def test_temperature_is_a_power(bandwidth: float | None) -> None:
+    squared = torch.tensor([[0.0, 0.5, 2.0, 0.1]])
+    one, two = (compute_heatmap(squared, bandwidth=bandwidth, temperature=t) for t in (1.0, 2.0))
+    torch.testing.assert_close(two, one.sqrt() / one.sqrt().sum())
 
 
 def test_entropy_of_uniform_is_log_of_its_area() -> None:
@@ -69,162 +49,6 @@ def test_entropy_of_one_cell_is_log_of_its_area() -> None:
 def test_entropy_of_a_gaussian() -> None:
     entropy = compute_entropy(draw_mixture(CORNERS[:1] + 140, 30.0).flatten(1), CELL_PX**2)
     assert entropy.item() == pytest.approx(np.log(2 * np.pi * np.e * 30**2), abs=1e-3)
-
-
-CUT_OFF = pytest.mark.xfail(reason="the fit sees the 256 strongest cells only: wide modes lose their outer parts")
-TOO_FEW = pytest.mark.xfail(reason="15 iterations do not converge where modes overlap: 60 do")
-
-
-@pytest.mark.parametrize(
-    ("n", "std_px"),
-    [(1, 8.0), (2, 8.0), (4, 8.0), (1, 16.0), (2, 16.0), (4, 16.0), (1, 32.0), pytest.param(4, 32.0, marks=CUT_OFF)],
-)
-def test_separated_modes_are_found_below_a_cells_size(n: int, std_px: float) -> None:
-    true = CORNERS[:n]
-    fit = fit_modes(draw_mixture(true, std_px), n, XS, YS)
-    assert measure_errors(fit.modes[0], true).max() < 0.1 * CELL_PX
-
-
-def test_random_separated_modes(rng: np.random.Generator) -> None:
-    for _ in range(20):
-        true = CORNERS + rng.uniform(-40, 40, (4, 2))
-        fit = fit_modes(draw_mixture(true, 12.0), 4, XS, YS)
-        assert measure_errors(fit.modes[0], true).max() < 0.1 * CELL_PX
-
-
-def test_a_modes_position_inside_its_cell_is_found() -> None:
-    offsets = np.linspace(0, CELL_PX, 8)
-    true = np.stack([200 + offsets, 300 - offsets], -1)[:, None]
-    fit = fit_modes(torch.cat([draw_mixture(t, 6.0) for t in true]), 1, XS, YS)
-    assert compute_mode_errors(fit.modes.double().numpy(), true).max() < 0.1 * CELL_PX
-
-
-def test_weights_are_found_and_sorted() -> None:
-    weights = np.array([0.2, 0.3, 0.22, 0.28])
-    fit = fit_modes(draw_mixture(CORNERS, 8.0, weights), 4, XS, YS)
-    order = np.argsort(-weights)
-    np.testing.assert_allclose(fit.modes[0], CORNERS[order], atol=1)
-    np.testing.assert_allclose(fit.weights[0], (weights[order] + 0.05) / 1.2, atol=0.01)  # drawn together by the prior
-
-
-@pytest.mark.xfail(reason="the peak search takes 1 / n of the mass: what a strong mode has left hides a weak one")
-def test_a_weak_mode_beside_a_strong_one_is_found() -> None:
-    fit = fit_modes(draw_mixture(CORNERS, 8.0, np.array([0.2, 0.4, 0.1, 0.3])), 4, XS, YS)
-    assert measure_errors(fit.modes[0], CORNERS).max() < CELL_PX
-
-
-def test_covariance_is_the_modes() -> None:
-    fit = fit_modes(draw_mixture(CORNERS[:1] + 140, 20.0), 1, XS, YS)
-    expected = np.eye(2) * (20.0**2 + (0.4 * CELL_PX) ** 2)  # a component is never narrower than part of a cell
-    np.testing.assert_allclose(fit.covariances[0, 0], expected, rtol=0.05, atol=1)
-
-
-def draw_overlapping(separation: float, std_px: float = 24.0) -> tuple[np.ndarray, Tensor]:
-    """Twelve pairs of modes (12, 2, 2) px, ``separation`` stds apart in any direction, and their heatmaps."""
-    rng, true = np.random.default_rng(0), []
-    for _ in range(12):
-        angle = rng.uniform(0, np.pi)
-        half = 0.5 * separation * std_px * np.array([np.cos(angle), np.sin(angle)])
-        true.append(rng.uniform(180, 300, 2) + np.array([half, -half]))
-    return np.array(true), torch.cat([draw_mixture(t, std_px) for t in true])
-
-
-def fit_with_scikit_learn(heatmap: Tensor, rng: np.random.Generator, samples: int = 3000) -> np.ndarray:
-    mass = heatmap.double().flatten().numpy()
-    drawn = rng.choice(len(mass), samples, p=mass / mass.sum())
-    xy = np.stack([XS.numpy()[drawn % CELLS], YS.numpy()[drawn // CELLS]], -1)
-    xy = xy + rng.uniform(-CELL_PX / 2, CELL_PX / 2, xy.shape)
-    return GaussianMixture(2, random_state=0).fit(xy).means_
-
-
-@pytest.mark.parametrize("separation", [1.5, 2.0, 3.0])
-def test_overlapping_modes_are_found_within_half_a_cell(separation: float) -> None:
-    true, heatmaps = draw_overlapping(separation)
-    assert compute_mode_errors(fit_modes(heatmaps, 2, XS, YS).modes.double().numpy(), true).mean() < CELL_PX / 2
-
-
-@pytest.mark.parametrize(
-    ("separation", "iterations"),
-    [
-        (1.5, 60),
-        (2.0, 60),
-        pytest.param(3.0, 60, marks=CUT_OFF),
-        pytest.param(1.5, ITERATIONS, marks=TOO_FEW),
-        pytest.param(2.0, ITERATIONS, marks=TOO_FEW),
-    ],
-)
-def test_overlapping_modes_no_worse_than_scikit_learn(
-    separation: float, iterations: int, rng: np.random.Generator
-) -> None:
-    true, heatmaps = draw_overlapping(separation)
-    ours = fit_modes(heatmaps, 2, XS, YS, iterations=iterations).modes.double().numpy()
-    theirs = np.stack([fit_with_scikit_learn(heatmap, rng) for heatmap in heatmaps])
-    assert compute_mode_errors(ours, true).mean() <= compute_mode_errors(theirs, true).mean()
-
-
-DEGENERATE = {
-    "flat": torch.full((1, CELLS, CELLS), 1 / CELLS**2),
-    "nothing": torch.zeros(1, CELLS, CELLS),
-    "one cell": one_cell(20, 33),
-    "first corner": one_cell(0, 0),
-    "last corner": one_cell(CELLS - 1, CELLS - 1),
-    "two cells": one_cell(0, CELLS - 1) + one_cell(CELLS - 1, 0),
-    "tiny": draw_mixture(CORNERS, 8.0) * 1e-20,
-    "huge": draw_mixture(CORNERS, 8.0) * 1e20,
-    "half on the edge": draw_mixture(np.array([[0.0, 200.0], [484.0, 300.0]]), 30.0),
-}
-
-
-@pytest.mark.parametrize("n", [1, 2, 4, 8])
-@pytest.mark.parametrize("name", DEGENERATE)
-def test_fit_is_sound_on_any_heatmap(name: str, n: int) -> None:
-    fit = fit_modes(DEGENERATE[name], n, XS, YS)
-    assert (fit.modes.shape, fit.weights.shape, fit.covariances.shape) == ((1, n, 2), (1, n), (1, n, 2, 2))
-    assert ((fit.modes >= -0.5) & (fit.modes <= 484.5)).all()  # false for NaN
-    assert fit.weights.sum().item() == pytest.approx(1)
-    assert (fit.weights[0].diff() <= 0).all()
-    assert torch.linalg.eigvalsh(fit.covariances).min() > 0
-
-
-def test_one_cell_is_its_own_mode() -> None:
-    fit = fit_modes(one_cell(0, CELLS - 1), 1, XS, YS)
-    torch.testing.assert_close(fit.modes[0, 0], torch.stack([XS[-1], YS[0]]))
-
-
-def test_double_heatmaps_are_taken() -> None:
-    one, two = (fit_modes(draw_mixture(CORNERS, 8.0).to(t), 4, XS, YS) for t in (torch.float32, torch.float64))
-    torch.testing.assert_close(one.modes, two.modes, rtol=0, atol=0.01)
-
-
-def test_each_query_has_its_own_number_of_modes() -> None:
-    heatmap = torch.cat([draw_mixture(CORNERS[:1], 8.0), draw_mixture(CORNERS, 8.0), draw_mixture(CORNERS[:2], 8.0)])
-    fit = fit_modes(heatmap, torch.tensor([1, 4, 2]), XS, YS)
-    assert torch.isfinite(fit.modes).all(-1).tolist() == [[True] + 3 * [False], 4 * [True], 2 * [True] + 2 * [False]]
-    assert ((fit.weights > 0) == torch.isfinite(fit.modes).all(-1)).all()
-    torch.testing.assert_close(fit.weights.sum(1), torch.ones(3))
-    assert measure_errors(fit.modes[2, :2], CORNERS[:2]).max() < 0.1 * CELL_PX
-
-
-def test_no_query_no_mode() -> None:
-    fit = fit_modes(torch.zeros(0, CELLS, CELLS), 4, XS, YS)
-    assert (fit.modes.shape[0], fit.modes.shape[2]) == (0, 2)
-
-
-@pytest.mark.parametrize("n", [0, -1])
-def test_at_least_one_mode(n: int) -> None:
-    with pytest.raises(ValueError, match=f"n must be at least 1, got {n}"):
-        fit_modes(one_cell(3, 3), n, XS, YS)
-
-
-@pytest.mark.parametrize("shape", [(CELLS, CELLS), (1, CELLS, CELLS - 1)])
-def test_heatmap_of_another_shape(shape: tuple[int, ...]) -> None:
-    with pytest.raises(ValueError, match=r"heatmap must have shape \(S, 64, 64\), got"):
-        fit_modes(torch.ones(shape), 1, XS, YS)
-
-
-def test_number_of_modes_of_another_length() -> None:
-    with pytest.raises(ValueError, match=r"n must be one number or of shape \(1,\), got shape \(3,\)"):
-        fit_modes(one_cell(3, 3), torch.tensor([1, 2, 3]), XS, YS)
 
 
 @pytest.fixture(scope="module")
@@ -346,3 +170,72 @@ def test_contrastive_weights_have_a_bandwidth(matcher: Matcher) -> None:
     config = dataclasses.replace(CONFIG, method="pcl", margin=2.0)
     assert Matcher(matcher.network, config, modes=1, size=SIZE, device="cpu").bandwidth == 0.5
     assert matcher.bandwidth is None
+
+
+def test_weights_carry_their_temperature(matcher: Matcher, image: np.ndarray, tmp_path: Path) -> None:
+    path = save_weights(tmp_path / "w.safetensors", matcher.network, temperature="2.5")
+    assert (Matcher.load(path, device="cpu").temperature, matcher.temperature) == (2.5, 1.0)
+    calm, sure = (m.match(image, image[::-1], xy=[(50, 60)]) for m in (Matcher.load(path, device="cpu"), matcher))
+    np.testing.assert_allclose(calm.cells, sure.cells**0.4 / (sure.cells**0.4).sum(), rtol=1e-3)
+
+
+def test_the_number_of_modes_may_be_given_or_found(matcher: Matcher, image: np.ndarray) -> None:
+    given, found = (matcher.match(image, image, xy=[(50, 60), (9, 9)], n=n) for n in (2, "auto"))
+    assert given.modes.shape == (2, 2, 2)
+    assert ((found.weights > 0).sum(1) >= 1).all()
+
+
+def answer(cells: torch.Tensor, n: int | str) -> Match:
+    """What a matcher with these heatmaps answers."""
+    blank = np.zeros((485, 485, 3), np.uint8)
+    centres = compute_cell_centres(SIZE, (CELLS, CELLS))
+    return make_match(blank, blank, np.zeros((len(cells), 2), np.float32), cells, centres, n)
+
+
+def test_best_is_the_narrowest_mode() -> None:
+    std = np.array([30.0, 12.0, 20.0, 25.0])
+    best = answer(draw_mixture(CORNERS, std), 4).best()
+    np.testing.assert_allclose(best.xy, CORNERS[[1]], atol=0.5)
+    np.testing.assert_allclose(best.spread_px, np.hypot(12, CELL_PX / np.sqrt(6)), rtol=0.02)
+
+
+def test_best_of_as_many_as_there_are() -> None:
+    best = answer(torch.cat([draw_mixture(CORNERS[:1], 12.0), draw_mixture(CORNERS[1:], 12.0)]), "auto").best()
+    assert np.isfinite(best.xy).all()
+    np.testing.assert_allclose(best.xy[0], CORNERS[0], atol=0.1)
+
+
+def test_confidence_is_the_mass_near_a_mode() -> None:
+    for std in (10.0, 20.0, 40.0):
+        match = answer(draw_mixture(CORNERS[:1] + 140, std), 1)
+        x, y = np.meshgrid(*(np.arange(485) - c for c in match.modes[0, 0]))
+        near = match.heatmap[0][np.hypot(x, y) <= 20].sum()
+        assert match.confidence(radius_px=20)[0, 0] == pytest.approx(near, abs=0.01)
+
+
+def test_four_equal_modes_are_as_sure_as_one() -> None:
+    one, four = (answer(draw_mixture(CORNERS[:n], 16.0), n).confidence() for n in (1, 4))
+    np.testing.assert_allclose(four, np.full((1, 4), one[0, 0]), atol=0.01)
+
+
+def test_a_weak_mode_is_less_sure() -> None:
+    match = answer(draw_mixture(CORNERS[:2], 8.0, np.array([0.9, 0.1])), 2)
+    confidence = match.confidence(radius_px=100)[0]
+    np.testing.assert_allclose(confidence, [1, 0.2], atol=0.01)
+
+
+def test_best_abstains_where_it_is_not_sure_enough() -> None:
+    match = answer(torch.cat([draw_mixture(CORNERS[:1], 6.0), draw_mixture(CORNERS[:1], 60.0)]), 1)
+    best = match.best(min_confidence=0.5)
+    assert np.isfinite(best.xy[0]).all() and np.isnan(best.xy[1]).all()
+    assert best.confidence[0] > 0.5 > best.confidence[1]
+
+
+def test_best_of_nothing() -> None:
+    assert answer(one_cell(3, 3)[:0], 4).best().xy.shape == (0, 2)
+
+
+@pytest.mark.parametrize(("name", "bad"), [("min_confidence", 1.1), ("min_confidence", -1), ("radius_px", 0)])
+def test_best_of_other_arguments(name: str, bad: float) -> None:
+    with pytest.raises(ValueError, match=f"{name} must be .*, got {bad}"):
+        answer(one_cell(3, 3), 1).best(**{name: bad})

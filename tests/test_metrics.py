@@ -11,10 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from mmgsd.metrics import aggregate, compute_mode_errors, compute_query_errors
+from mmgsd.metrics import aggregate, compute_mahalanobis2, compute_mode_errors, compute_query_errors
 
 TRUE = np.array([[[0.0, 0.0], [100.0, 0.0]]])
 MODES = np.array([[[100.0, 8.0], [3.0, 4.0]]])  # 8 px from the second, 5 px from the first
+COVARIANCES = np.array([[np.diag([16.0, 64.0]), np.diag([9.0, 4.0])]])  # px²
 
 
 @st.composite
@@ -34,14 +35,35 @@ def test_errors_by_hand() -> None:
 
 
 def test_query_metrics_by_hand() -> None:
-    metrics = compute_query_errors(MODES, TRUE)
-    assert {name: float(value[0]) for name, value in metrics.items()} == pytest.approx(
-        {"rmse_px": np.sqrt((25 + 64) / 2), "nearest_px": 8.0, "pck@5px": 0.5, "pck@10px": 1.0, "pck@20px": 1.0}
-    )
+    metrics = compute_query_errors(MODES, COVARIANCES, TRUE)
+    assert {name: float(value[0]) for name, value in metrics.items()} == pytest.approx({
+        "rmse_px": np.sqrt((25 + 64) / 2), "nearest_px": 8.0, "best_px": 5.0,
+        "pck@5px": 0.5, "pck@10px": 1.0, "pck@20px": 1.0,
+    })  # fmt: skip
+
+
+def test_without_covariances_the_first_mode_is_the_best() -> None:
+    metrics = compute_query_errors(MODES, np.full_like(COVARIANCES, np.nan), TRUE)
+    assert metrics["best_px"][0] == metrics["nearest_px"][0] == 8.0
+
+
+def test_mahalanobis_distances_by_hand() -> None:
+    expected = [[3**2 / 9 + 4**2 / 4, 8**2 / 64]]  # in the order of the true modes
+    np.testing.assert_allclose(compute_mahalanobis2(MODES, COVARIANCES, TRUE), expected)
+
+
+def test_a_turned_ellipse() -> None:
+    turn = np.array([[0.6, -0.8], [0.8, 0.6]])
+    covariance = turn @ np.diag([100.0, 1.0]) @ turn.T
+    along, across = ([[turn[:, k] * 10]] for k in (0, 1))
+    distances = [
+        compute_mahalanobis2(np.zeros((1, 1, 2)), covariance[None, None], np.array(t)) for t in (along, across)
+    ]
+    np.testing.assert_allclose(np.ravel(distances), [1, 100])
 
 
 def test_nearest_is_of_the_most_probable_mode() -> None:
-    metrics = compute_query_errors(MODES[:, ::-1], TRUE)
+    metrics = compute_query_errors(MODES[:, ::-1], COVARIANCES[:, ::-1], TRUE)
     assert metrics["nearest_px"][0] == pytest.approx(5.0)
 
 
@@ -90,9 +112,16 @@ def test_shapes_must_agree(modes: tuple[int, ...], true: tuple[int, ...]) -> Non
 
 
 def test_aggregate_by_hand() -> None:
-    columns = {"nearest_px": [1.0, 1.0, 4.0], "pck@5px": [1.0, 0.5, 0.0], "pck@10px": 1.0, "pck@20px": 1.0}
+    columns = {
+        "nearest_px": [1.0, 1.0, 4.0],
+        "best_px": [2.0, 0.0, 1.0],
+        "pck@5px": [1.0, 0.5, 0.0],
+        "pck@10px": 1.0,
+        "pck@20px": 1.0,
+    }
     summary = aggregate(pd.DataFrame({"rmse_px": [3.0, 4.0, 12.0], **columns}))
     assert summary == {
         "rmse_mean": 6.3333, "rmse_pooled": 7.5056, "median": 4.0, "nearest_mean": 2.0,
+        "best_mean": 1.0,
         "pck@5px": 0.5, "pck@10px": 1.0, "pck@20px": 1.0, "queries": 3,
     }  # fmt: skip

@@ -1,0 +1,242 @@
+"""n-modal Gaussian mixtures fitted to heatmaps: weighted expectation-maximisation, batched over queries.
+
+Peaks, one after another, are where it starts. A log-density is linear in (1, x, y, x², xy, y²), so an E-step is one
+matrix product with these six numbers of every cell, and an M-step, which needs their means, another. Where modes
+overlap, expectation-maximisation creeps: SQUAREM (Varadhan and Roland, Scandinavian Journal of Statistics 2008) leaps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+CYCLES, ROUND = 60, 3  # of three EM steps and a leap, at most; a query at rest is left alone after each round
+TOLERANCE_CELLS = 0.005  # the most that a mode at rest moves in a round
+LEAP = 16.0  # the longest leap, in steps
+KERNEL_CELLS = 2.0  # std of the kernel that finds the initial peaks
+SPREAD = (1 / 12, 10 / 12, 1 / 12)  # of a cell's mass: to second order what bilinear interpolation to pixels does
+MIN_VARIANCE = 0.05  # cells²
+PRIOR_WEIGHT = 1.0  # heatmap mass by which each component is a priori as likely as any other
+PRIOR_SHAPE = 0.2  # heatmap mass by which each component is a priori round and as wide as their average
+CHUNK = {"cpu": 2**19, "cuda": 2**26}  # numbers in the largest array of a fit: fits a core's cache, or fills a GPU
+MOST_MODES, SAMPLES = 8, 200  # n="auto": the most modes tried; a heatmap weighs as much as so many drawn pixels
+ELLIPSE = 5.991  # squared Mahalanobis distance of the ellipse that holds 95 % of a Gaussian in the plane
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """Gaussian mixtures fitted to S heatmaps, most probable mode first; absent modes have weight 0, else NaN."""
+
+    modes: Tensor  # (S, N, 2) px
+    weights: Tensor  # (S, N), sum to 1
+    covariances: Tensor  # (S, N, 2, 2) px²
+    outside: Tensor  # (S,) mass of the heatmap outside every mode's 95 % ellipse
+
+
+def fit_modes(heatmap: Tensor, n: int | str | Tensor, xs: Tensor, ys: Tensor, *, cycles: int = CYCLES) -> Mixture:
+    """Fit an n-modal Gaussian mixture to each heatmap by weighted expectation-maximisation.
+
+    ``heatmap`` (S, h, w) not negative, ``n`` modes for all or (S,), or "auto" for what the Bayesian information
+    criterion prefers; ``xs`` (w,) and ``ys`` (h,) cell centres in px. Symmetric modes are a priori equally likely,
+    round and equally wide: that decides which cell belongs to which mode, while the result holds the moments of the
+    mass itself. Raises ValueError for other shapes, n < 1 or another word.
+    """
+    n, n_max = _check_fit(heatmap, n, xs, ys)
+    heatmap = heatmap.float()
+    total = heatmap.flatten(1).sum(-1, keepdim=True)
+    mass = torch.where(total > 0, heatmap.flatten(1) / total.clamp(min=1e-30), 1 / (len(xs) * len(ys)))
+    grid = heatmap.shape[1:]
+    mass = _interpolate(mass, grid)
+    state = _choose_fit(mass, grid, cycles) if n is None else _fit(mass, n, n_max, grid, cycles)
+    outside = _measure_outside(mass, state, grid)
+    order = state[..., 2].argsort(-1, descending=True)
+    state = state.gather(1, order[..., None].expand_as(state))
+    absent = (state[..., 2] == 0)[..., None]
+    step = torch.stack([xs[1] - xs[0], ys[1] - ys[0]])  # px a cell
+    modes = state[..., :2] * step + torch.stack([xs.mean(), ys.mean()])
+    a, b, c = state[..., 3:].unbind(-1)
+    covariances = torch.stack([torch.stack([a, b], -1), torch.stack([b, c], -1)], -2) * step[:, None] * step
+    nan = torch.nan
+    return Mixture(
+        modes.masked_fill(absent, nan), state[..., 2], covariances.masked_fill(absent[..., None], nan), outside
+    )
+
+
+# A fit's state is (S, N, 6): a component's mean x, y, weight and covariance [[a, b], [b, c]], all in cells and from the
+# grid's centre, so that one regularisation suits every image size. Weight 0 marks a component that a query has not.
+
+
+def _fit(mass: Tensor, n: Tensor, n_max: int, grid: tuple[int, int], cycles: int) -> Tensor:
+    """State of the fit to (S, C) mass, in chunks of queries: memory stays bounded, and a chunk in the cache."""
+    size = max(1, CHUNK[mass.device.type] // (n_max * mass.shape[1]))
+    cells = _describe_cells(grid, mass.device)
+    states = []
+    for part, count in zip(mass.split(size), n.split(size), strict=True):
+        starts = [_start(part, count, n_max, grid, most) for most in (1 / count, torch.ones_like(count))]
+        starts = [_run_cycle(part, start, cells) for start in starts]
+        better = _compute_log_likelihood(part, starts[0], cells) >= _compute_log_likelihood(part, starts[1], cells)
+        state = torch.where(better[:, None, None], *starts)
+        states.append(_run_em(part, state, cells, cycles))
+    return torch.cat(states)
+
+
+def _interpolate(mass: Tensor, grid: tuple[int, int]) -> Tensor:
+    """(S, C) mass whose moments are those of the heatmap at full resolution."""
+    matrices = []
+    for count in grid:
+        matrix = sum(share * torch.eye(count + 2)[k : k + count] for k, share in enumerate(SPREAD))
+        matrix[:, 1], matrix[:, -2] = (
+            matrix[:, 1] + matrix[:, 0],
+            matrix[:, -2] + matrix[:, -1],
+        )  # none leaves the image
+        matrices.append(matrix[:, 1:-1].to(mass.device))
+    return (matrices[0].T @ mass.view(-1, *grid) @ matrices[1]).flatten(1)
+
+
+def _start(mass: Tensor, n: Tensor, n_max: int, grid: tuple[int, int], most: Tensor) -> Tensor:
+    """State at n peaks found one after another, each taking up to ``most`` (S,) of all mass around it away.
+
+    All of it, and a weak mode is not hidden by what a strong one leaves; 1 / n, and modes on top of each other are
+    found as often as they are there.
+    """
+    (h, w), rest = grid, mass.view(-1, *grid)
+    blur_y, blur_x = (_make_kernel(count, mass.device) for count in grid)
+    peaks = []
+    for _ in range(n_max):
+        local = blur_y @ (rest @ blur_x)
+        # the blurred mass finds the region, the mass itself the peak inside it
+        index = (local * (rest + 1e-3 * local)).flatten(1).argmax(-1)
+        share = local.flatten(1).gather(1, index[:, None])
+        row, column = index // w, index % w
+        taken = (most[:, None] / share.clamp(min=1e-12)).clamp(max=1)
+        rest = rest * (1 - taken[..., None] * blur_y[row][:, :, None] * blur_x[column][:, None])
+        peaks.append(torch.stack([column - (w - 1) / 2, row - (h - 1) / 2], -1))
+    present = torch.arange(n_max, device=n.device) < n[:, None]
+    variance = torch.full(present.shape, KERNEL_CELLS**2, device=n.device)
+    rest = torch.stack([present / n[:, None], variance, 0 * variance, variance], -1)
+    return torch.cat([torch.stack(peaks, 1), rest], -1)
+
+
+def _make_kernel(count: int, device: torch.device) -> Tensor:
+    at = torch.arange(count, device=device)
+    return torch.exp(-0.5 * ((at[:, None] - at) / KERNEL_CELLS) ** 2)
+
+
+def _describe_cells(grid: tuple[int, int], device: torch.device) -> Tensor:
+    """(6, C): 1, x, y, x², xy, y² of each cell, in which log-densities are linear and whose means are moments."""
+    y, x = (torch.arange(count, device=device) - (count - 1) / 2 for count in grid)
+    x, y = (t.flatten() for t in torch.meshgrid(x, y, indexing="xy"))
+    return torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y])
+
+
+def _run_em(mass: Tensor, state: Tensor, cells: Tensor, cycles: int) -> Tensor:
+    """Iterate until at rest; then the moments of each component's share of the mass, without the priors."""
+    moving = torch.arange(len(mass), device=mass.device)
+    for _ in range(0, cycles, ROUND):
+        before = after = state[moving]
+        for _ in range(ROUND):
+            after = _run_cycle(mass[moving], after, cells)
+        state[moving] = after
+        moving = moving[(after - before)[..., :2].abs().amax((1, 2)) > TOLERANCE_CELLS]
+    present, state = state[..., 2] > 0, _compute_moments(mass, state, cells)
+    state[..., 2] = torch.where(present, state[..., 2].clamp(min=1e-9), 0)  # 0 stays the mark of an absent one
+    return state
+
+
+def _run_cycle(mass: Tensor, state: Tensor, cells: Tensor) -> Tensor:
+    """Two EM steps, a leap as far as their change of pace suggests, and a step that steadies it."""
+    first = _step(mass, state, cells)
+    second = _step(mass, first, cells)
+    pace, change = first - state, second - 2 * first + state
+    length = pace.flatten(1).norm(dim=1) / change.flatten(1).norm(dim=1).clamp(min=1e-12)
+    length = length.clamp(1, LEAP)[:, None, None]
+    leapt = state + 2 * length * pace + length**2 * change
+    weight, a, b, c = leapt[..., 2:].unbind(-1)
+    lawful = (a > MIN_VARIANCE) & (c > MIN_VARIANCE) & (a * c - b * b > MIN_VARIANCE**2) & (weight >= 0)
+    return _step(mass, torch.where(lawful.all(1)[:, None, None], leapt, second), cells)
+
+
+def _step(mass: Tensor, state: Tensor, cells: Tensor) -> Tensor:
+    """One step of EM with the priors."""
+    mean, weight, covariance = _compute_moments(mass, state, cells).split([2, 1, 3], -1)
+    width = 0.5 * (weight * covariance[..., ::2]).sum((1, 2)) / weight.sum((1, 2))  # (S,)
+    average = width[:, None, None] * width.new_tensor([1.0, 0.0, 1.0])
+    covariance = (weight * covariance + PRIOR_SHAPE * average) / (weight + PRIOR_SHAPE)
+    weight = (weight + PRIOR_WEIGHT) * (state[..., 2:3] > 0)
+    return torch.cat([mean, weight / weight.sum(1, keepdim=True), covariance], -1)
+
+
+def _compute_moments(mass: Tensor, state: Tensor, cells: Tensor) -> Tensor:
+    """State of the components' shares of the (S, C) mass: an E-step and an M-step."""
+    share = torch.softmax(_compute_log_densities(state, cells), 1).mul_(mass[:, None])  # (S, N, C)
+    moments = share @ cells.T  # (S, N, 6)
+    weight = moments[..., :1]
+    mean, (xx, xy, yy) = moments[..., 1:3] / weight.clamp(min=1e-9), moments[..., 3:].unbind(-1)
+    mean = torch.where(weight > 1e-9, mean, state[..., :2])
+    x, y = mean.unbind(-1)
+    count = weight[..., 0].clamp(min=1e-9)
+    a, b, c = xx / count - x * x, xy / count - x * y, yy / count - y * y
+    covariance = torch.stack([a.clamp(min=MIN_VARIANCE) + 1e-3, b, c.clamp(min=MIN_VARIANCE) + 1e-3], -1)
+    return torch.cat([mean, weight, covariance], -1)
+
+
+def _compute_log_densities(state: Tensor, cells: Tensor) -> Tensor:
+    """ln(weight * density) of each component at each cell, (S, N, C), less the constant ln 2π."""
+    x, y, weight, a, b, c = state.unbind(-1)
+    determinant = a * c - b * b
+    p, q, r = c / determinant, -b / determinant, a / determinant  # the inverse covariance [[p, q], [q, r]]
+    at_origin = weight.log() - 0.5 * determinant.log() - 0.5 * (p * x * x + 2 * q * x * y + r * y * y)
+    at_origin = at_origin.clamp(min=-1e30)  # of a component that is not there; -inf times 0 would be NaN
+    return torch.stack([at_origin, p * x + q * y, q * x + r * y, -0.5 * p, -q, -0.5 * r], -1) @ cells
+
+
+def _compute_log_likelihood(mass: Tensor, state: Tensor, cells: Tensor) -> Tensor:
+    """Mean log-density (S,) of the mass, each component wider by a cell's own spread: no spike between cells counts."""
+    state = state + 2 * SPREAD[0] * state.new_tensor([0, 0, 0, 1, 0, 1])
+    return (_compute_log_densities(state, cells).logsumexp(1) * mass).sum(-1)
+
+
+def _choose_fit(mass: Tensor, grid: tuple[int, int], cycles: int) -> Tensor:
+    """State (S, 8, 6) with as many components as the Bayesian information criterion prefers."""
+    cells, states, criteria = _describe_cells(grid, mass.device), [], []
+    for n in range(1, MOST_MODES + 1):
+        state = _fit(mass, torch.full((len(mass),), n, device=mass.device), n, grid, cycles)
+        likelihood = SAMPLES * _compute_log_likelihood(mass, state, cells)
+        criteria.append((6 * n - 1) * float(np.log(SAMPLES)) - 2 * likelihood)
+        states.append(F.pad(state, (0, 0, 0, MOST_MODES - n)))
+    best = torch.stack(criteria).argmin(0)  # (S,)
+    return torch.stack(states)[best, torch.arange(len(mass), device=mass.device)]
+
+
+def _measure_outside(mass: Tensor, state: Tensor, grid: tuple[int, int]) -> Tensor:
+    """Mass (S,) outside every component's 95 % ellipse."""
+    x, y = _describe_cells(grid, mass.device)[1:3]
+    outside = torch.ones_like(mass, dtype=torch.bool)
+    for component in state.unbind(1):
+        mean_x, mean_y, weight, a, b, c = component[..., None].unbind(1)  # (S, 1) each
+        dx, dy = x - mean_x, y - mean_y
+        inside = c * dx * dx - 2 * b * dx * dy + a * dy * dy <= ELLIPSE * (a * c - b * b)
+        outside &= ~inside | (weight == 0)
+    return (mass * outside).sum(-1)
+
+
+def _check_fit(heatmap: Tensor, n: int | str | Tensor, xs: Tensor, ys: Tensor) -> tuple[Tensor | None, int]:
+    """The number of modes (S,), or None where the data are to choose it, and the most that can be."""
+    if heatmap.ndim != 3 or heatmap.shape[1:] != (len(ys), len(xs)):
+        raise ValueError(f"heatmap must have shape (S, {len(ys)}, {len(xs)}), got {tuple(heatmap.shape)}")
+    if isinstance(n, str):
+        if n != "auto":
+            raise ValueError(f"n must be a number, one for each query, or 'auto', got {n!r}")
+        return None, MOST_MODES
+    n = torch.as_tensor(n, device=heatmap.device)
+    if n.is_floating_point() or n.dtype == torch.bool:
+        raise ValueError(f"n must be an integer, or integers, or 'auto', got {n.dtype}")
+    if n.ndim and n.shape != heatmap.shape[:1]:
+        raise ValueError(f"n must be one number or of shape ({len(heatmap)},), got shape {tuple(n.shape)}")
+    if n.numel() and int(n.min()) < 1:
+        raise ValueError(f"n must be at least 1, got {int(n.min())}")
+    return n.expand(len(heatmap)), int(n.max()) if n.numel() else 1

@@ -1,0 +1,121 @@
+"""How far a table's uncertainties can be trusted: does entropy rank errors, do ellipses hold what they promise, does
+mass outside them tell that a match is occluded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+from scipy.stats import chi2, spearmanr
+from sklearn.metrics import roc_auc_score
+
+LEVELS = tuple(round(0.05 * i, 2) for i in range(1, 20))  # expected coverage of a mode's ellipse: 5, 10 … 95 %
+REPORTED = (0.5, 0.9, 0.95)
+
+
+def compute_risk_coverage(error: np.ndarray, score: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Coverage (S,) and risk (S,): share of the queries kept, lowest score first, and the mean error of those kept.
+
+    ``error`` (S,), its unit the risk's, and ``score`` (S,), high where uncertain. Queries of one score share their mean
+    error, so that the rows' order does not matter. ValueError for other shapes, or numbers not finite. Risk-coverage
+    curve of El-Yaniv and Wiener, "On the foundations of noise-free selective classification" (JMLR 2010).
+    """
+    error, score = _check_pair(error, score, "error", "score")
+    for name, values in {"error": error, "score": score}.items():
+        if not np.isfinite(values).all():
+            raise ValueError(f"{name} must be finite, got {np.sum(~np.isfinite(values))} values that are not")
+    order = np.lexsort((error, score))
+    _, tied = np.unique(score[order], return_inverse=True)
+    shared = np.bincount(tied, error[order]) / np.bincount(tied)  # (scores,)
+    kept = np.arange(1, len(error) + 1)
+    return kept / max(len(error), 1), np.cumsum(shared[tied]) / kept
+
+
+def compute_aurc(error: np.ndarray, score: np.ndarray) -> float:
+    """Area under the risk-coverage curve, the mean risk over all coverages: in the error's unit, NaN of no query."""
+    risk = compute_risk_coverage(error, score)[1]
+    return float(risk.mean()) if len(risk) else np.nan
+
+
+def compute_coverage(mahalanobis2: np.ndarray, levels: Sequence[float] = LEVELS) -> np.ndarray:
+    """Observed share (L,) of true matches within the ellipse that a Gaussian fills to each expected level (L,).
+
+    ``mahalanobis2`` (M,) squared distances, one a true match. NaN, a match without an ellipse, counts as not within;
+    all are NaN where all distances are, or there are none. ValueError where a level is not in (0, 1).
+    """
+    distances, levels = np.asarray(mahalanobis2, float), np.asarray(levels, float)
+    if distances.ndim != 1:
+        raise ValueError(f"mahalanobis2 must have shape (M,), got {distances.shape}")
+    if not ((levels > 0) & (levels < 1)).all():
+        raise ValueError(f"levels must lie in (0, 1), got {levels.tolist()}")
+    if np.isnan(distances).all():
+        return np.full(len(levels), np.nan)
+    ordered = np.sort(distances)  # NaN last
+    return np.searchsorted(ordered, chi2.ppf(levels, 2), side="right") / len(ordered)
+
+
+def compute_coverage_error(mahalanobis2: np.ndarray, levels: Sequence[float] = LEVELS) -> float:
+    """Expected calibration error: mean of |observed - expected| coverage over the levels, in [0, 1]."""
+    return float(np.abs(compute_coverage(mahalanobis2, levels) - levels).mean())
+
+
+def compute_auroc(score: np.ndarray, positive: np.ndarray) -> float:
+    """Probability that a positive's score exceeds a negative's, ties a half; NaN without one of them, or of a NaN.
+
+    ``score`` (S,) and ``positive`` (S,) bool. ValueError for other shapes.
+    """
+    score, positive = _check_pair(score, positive, "score", "positive")
+    positive = positive > 0
+    if np.isnan(score).any() or len(np.unique(positive)) < 2:
+        return np.nan
+    return float(roc_auc_score(positive, score))
+
+
+def get_distances(queries: pd.DataFrame) -> np.ndarray:
+    """(M,) squared Mahalanobis distances of all true matches of the queries with a visible source."""
+    rows = queries.mahalanobis2[queries.visible]
+    return np.concatenate([np.empty(0), *rows]).astype(float)
+
+
+def summarise_uncertainty(queries: pd.DataFrame) -> dict[str, float | None]:
+    """Quality of the uncertainties of queries with a visible source; None, JSON's null, for what is undefined.
+
+    ``spearman`` of entropy and error; ``aurc`` (px) by entropy, ``aurc_oracle`` by the error itself, ``aurc_random``
+    without a score, ``aurc_share`` = (aurc - oracle) / (random - oracle): 0 as good as the oracle, 1 as random;
+    ``coverage@50%`` … and ``ece`` of the ellipses, each true match counts; ``auroc_occluded`` and ``auroc_absent``:
+    mass outside the ellipses tells that at least one true match is hidden, or all are.
+    """
+    seen = queries[queries.visible]
+    distances = get_distances(queries)
+    coverage = compute_coverage(distances, REPORTED)
+    summary = _summarise_risk(seen.rmse_px.to_numpy(float), seen.entropy.to_numpy(float)) | {
+        **{f"coverage@{100 * level:.0f}%": share for level, share in zip(REPORTED, coverage, strict=True)},
+        "ece": compute_coverage_error(distances),
+        "auroc_occluded": compute_auroc(seen.outside, seen.hidden >= 1),
+        "auroc_absent": compute_auroc(seen.outside, seen.hidden == seen.n),
+    }
+    rounded = {name: round(float(value), 4) if np.isfinite(value) else None for name, value in summary.items()}
+    return rounded | {"queries": len(seen)}
+
+
+def _summarise_risk(error: np.ndarray, entropy: np.ndarray) -> dict[str, float]:
+    varied = len(np.unique(entropy)) > 1 and len(np.unique(error)) > 1
+    aurc = compute_aurc(error, entropy) if np.isfinite(entropy).all() else np.nan
+    oracle, mean = compute_aurc(error, error), error.mean() if len(error) else np.nan
+    return {
+        "spearman": spearmanr(entropy, error).statistic if varied else np.nan,
+        "aurc": aurc,
+        "aurc_oracle": oracle,
+        "aurc_random": mean,
+        "aurc_share": (aurc - oracle) / (mean - oracle) if error.size and np.ptp(error) > 0 else np.nan,
+    }
+
+
+def _check_pair(first: np.ndarray, second: np.ndarray, *names: str) -> tuple[np.ndarray, np.ndarray]:
+    """Both as floats (S,); ValueError where they do not share that shape."""
+    first, second = np.asarray(first, float), np.asarray(second, float)
+    if first.shape != second.shape or first.ndim != 1:
+        raise ValueError(f"{' and '.join(names)} must share one shape (S,), got {first.shape} and {second.shape}")
+    return first, second

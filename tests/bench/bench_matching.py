@@ -1,0 +1,158 @@
+"""How fast queries are answered, and whether the fast way's answers are the plain way's.
+
+``python tests/bench/bench_matching.py [pairs] [preset]``: the cloth model of ``preset`` (default ``quick``, which
+`make reproduce` trains), asked about ``pairs`` (default 40) pairs of test images, 625 points each, in one run:
+
+- ours: descriptors, heatmaps, entropies and four-modal fits of all pairs, as the evaluation does it;
+- the plain way: one query at a time the heatmap at all pixels and scikit-learn's GaussianMixture on pixels drawn from it;
+- the arg-min: one query at a time the least descriptor distance over all pixels in numpy, as Dense Object Nets do;
+- one query on fresh images by `Matcher.match`, network included;
+- agreement: our modes beside those of the same mixture fitted at all pixels in double precision, until at rest.
+"""
+
+import resource
+import sys
+import time
+
+import cv2
+import numpy as np
+import torch
+from sklearn.mixture import GaussianMixture
+
+from mmgsd.config import Paths, find_root, load_preset
+from mmgsd.dataset import load_dataset, sample_pairs
+from mmgsd.matching import Matcher, read_heatmap
+from mmgsd.metrics import compute_mode_errors
+from mmgsd.mixture import PRIOR_SHAPE, PRIOR_WEIGHT
+from mmgsd.network import compute_cell_centres
+from mmgsd.training import WEIGHTS
+
+MODES, PLAIN, DRAWN, AGREE_PX = 4, 40, 10_000, 0.25  # modes, queries asked the plain way, pixels drawn for each
+
+
+def measure_ours(matcher, data, pairs):
+    """Queries a second of the whole evaluation."""
+    start = time.perf_counter()
+    used = np.unique(pairs).tolist()
+    descriptors = {}
+    for i in range(0, len(used), 16):
+        part = used[i : i + 16]
+        descriptors |= zip(part, matcher.describe([data.load_image(k) for k in part]), strict=True)
+    for first, second in pairs:
+        xy = torch.from_numpy(data.xy[first])
+        heatmap = matcher.compute_heatmaps(descriptors[first], descriptors[second], xy, data.size)
+        read_heatmap(heatmap, MODES, compute_cell_centres(data.size, heatmap.shape[-2:]))
+    return len(pairs) * data.xy.shape[1] / (time.perf_counter() - start), descriptors
+
+
+def draw_queries(data, pairs):
+    """(first, second, point) of the queries that the slow ways are asked."""
+    rng = np.random.default_rng(0)
+    return [(*pairs[i % len(pairs)], int(rng.integers(data.xy.shape[1]))) for i in range(PLAIN)]
+
+
+def measure_plain(matcher, data, descriptors, queries):
+    """Queries a second, and the modes that scikit-learn finds."""
+    rng, modes, seconds = np.random.default_rng(0), [], 0.0
+    for first, second, point in queries:
+        start = time.perf_counter()
+        pixels = compute_pixels(matcher, data, descriptors, first, second, point)
+        drawn = rng.choice(pixels.size, DRAWN, p=pixels.ravel())
+        xy = np.stack([drawn % data.size[0], drawn // data.size[0]], -1)
+        modes.append(GaussianMixture(MODES, random_state=0).fit(xy).means_)
+        seconds += time.perf_counter() - start
+    return len(queries) / seconds, np.stack(modes)
+
+
+def compute_pixels(matcher, data, descriptors, first, second, point):
+    """Heatmap (H, W) over all pixels of one query."""
+    xy = torch.from_numpy(data.xy[first, [point]])
+    cells = matcher.compute_heatmaps(descriptors[first], descriptors[second], xy, data.size)[0]
+    pixels = cv2.resize(cells.double().numpy(), data.size, interpolation=cv2.INTER_LINEAR)
+    return pixels / pixels.sum()
+
+
+def fit_all_pixels(pixels, means):
+    """The same mixture as ours, written plainly: every pixel, double precision, until no mode moves by 0.001 px."""
+    y, x = (a[pixels > 1e-12].astype(float) for a in np.indices(pixels.shape))
+    mass, xy = pixels[pixels > 1e-12], np.stack([x, y], -1)
+    weights, shapes = np.full(len(means), 1 / len(means)), np.stack([np.eye(2) * 900.0] * len(means))
+    for _ in range(3000):
+        score = []
+        for mean, weight, shape in zip(means, weights, shapes, strict=True):
+            offset = xy - mean
+            squared = np.einsum("ci,ij,cj->c", offset, np.linalg.inv(shape), offset)
+            score.append(np.log(weight) - 0.5 * np.linalg.slogdet(shape)[1] - 0.5 * squared)
+        share = np.exp(score - np.max(score, 0))
+        share *= mass / share.sum(0)
+        before, count = means, share.sum(1)
+        means = share @ xy / count[:, None]
+        own = [(s * (xy - m).T) @ (xy - m) / c for s, m, c in zip(share, means, count, strict=True)]
+        average = np.eye(2) * sum(c * np.trace(o) / 2 for c, o in zip(count, own, strict=True))
+        shapes = np.stack(
+            [(c * o + PRIOR_SHAPE * average) / (c + PRIOR_SHAPE) for c, o in zip(count, own, strict=True)]
+        )
+        weights = (count + PRIOR_WEIGHT) / (count + PRIOR_WEIGHT).sum()
+        if np.abs(means - before).max() < 1e-3:
+            break
+    return means
+
+
+def measure_argmin(data, descriptors, queries):
+    """Queries a second of a search over all pixels."""
+    _, second, _ = queries[0]
+    grid = descriptors[second].permute(1, 2, 0).numpy()
+    full = np.stack([cv2.resize(grid[..., k], data.size) for k in range(grid.shape[-1])], -1)  # (H, W, D)
+    start = time.perf_counter()
+    for first, _, point in queries:
+        x, y = np.rint(data.xy[first, point]).astype(int).clip(0, np.array(data.size) - 1)
+        np.square(full - full[y, x]).sum(-1).argmin()
+    return len(queries) / (time.perf_counter() - start)
+
+
+def measure_one(matcher, data, queries):
+    """Median milliseconds of one query on fresh images."""
+    took = []
+    for first, second, point in queries:
+        images = data.load_image(first), data.load_image(second)
+        start = time.perf_counter()
+        matcher.match(*images, data.xy[first, [point]])
+        took.append(1000 * (time.perf_counter() - start))
+    return float(np.median(took))
+
+
+def main():
+    """Print what was measured, then the line that is compared."""
+    pairs, preset = (int(sys.argv[1]) if len(sys.argv) > 1 else 40), (sys.argv[2:] or ["quick"])[0]
+    paths, config = Paths(find_root(), preset), load_preset(preset).train["cloth"]
+    data = load_dataset(paths.dataset("cloth"), "test")
+    matcher = Matcher.load(paths.model(config) / WEIGHTS)
+    if str(matcher.device) != "cpu":
+        raise SystemExit("the comparison is made on a CPU: set CUDA_VISIBLE_DEVICES=''")
+    chosen = [tuple(pair) for pair in sample_pairs(data.episode, pairs, np.random.default_rng(0)).tolist()]
+    queries = draw_queries(data, chosen)
+    measure_ours(matcher, data, chosen[:2])  # warms up
+    ours, descriptors = measure_ours(matcher, data, chosen)
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    plain, theirs = measure_plain(matcher, data, descriptors, queries)
+    argmin, one = measure_argmin(data, descriptors, queries), measure_one(matcher, data, queries)
+    fast, exact = [], []
+    for first, second, point in queries:
+        cells = matcher.compute_heatmaps(
+            descriptors[first], descriptors[second], torch.from_numpy(data.xy[first, [point]]), data.size
+        )
+        fit, _ = read_heatmap(cells, MODES, compute_cell_centres(data.size, cells.shape[-2:]))
+        fast.append(fit.modes[0].double().numpy())
+        exact.append(fit_all_pixels(compute_pixels(matcher, data, descriptors, first, second, point), fast[-1]))
+    apart, sklearn_apart = (compute_mode_errors(np.stack(fast), other).max(1) for other in (np.stack(exact), theirs))
+    print(f"cloth, preset {preset}, grid {'x'.join(map(str, cells.shape[-2:]))}, {torch.get_num_threads()} threads")
+    print(f"one query on fresh images: {one:.0f} ms; memory of {pairs} pairs: {memory:.2f} GiB")
+    print(f"agreement with the same mixture at all pixels: {100 * (apart <= AGREE_PX).mean():.0f} % within {AGREE_PX} px, "
+          f"median {np.median(apart):.3f} px, most {apart.max():.2f} px; with scikit-learn's: median "
+          f"{np.median(sklearn_apart):.1f} px")  # fmt: skip
+    print(f"plain way {plain:.1f} queries/s, arg-min {argmin:.1f} queries/s")
+    print(f"{ours:.0f} queries/s, {ours / plain:.0f} x the plain way, {ours / argmin:.0f} x arg-min")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,31 @@
+"""Heatmaps whose modes are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mmgsd.network import compute_cell_centres
+
+SIZE, CELLS = (485, 485), 64
+CELL_PX = SIZE[0] / CELLS
+XS, YS = compute_cell_centres(SIZE, (CELLS, CELLS))
+CORNERS = np.array([[100.3, 100.0], [380.0, 110.9], [375.2, 371.7], [105.5, 383.1]])
+
+
+def draw_mixture(modes: np.ndarray, std_px: float | np.ndarray, weights: np.ndarray | None = None) -> Tensor:
+    """Heatmap (1, 64, 64) of isotropic Gaussians at ``modes`` (N, 2) px."""
+    weights = np.ones(len(modes)) if weights is None else weights
+    std = np.broadcast_to(std_px, len(modes))
+    x, y = XS.numpy()[None, None, :], YS.numpy()[None, :, None]
+    squared = (x - modes[:, 0, None, None]) ** 2 + (y - modes[:, 1, None, None]) ** 2
+    density = np.exp(-squared / (2 * std[:, None, None] ** 2)) / std[:, None, None] ** 2
+    heatmap = (weights[:, None, None] * density).sum(0)
+    return torch.from_numpy(heatmap / heatmap.sum())[None].float()
+
+
+def one_cell(row: int, column: int) -> Tensor:
+    heatmap = torch.zeros(1, CELLS, CELLS)
+    heatmap[0, row, column] = 1
+    return heatmap
