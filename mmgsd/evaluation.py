@@ -99,7 +99,7 @@ def write_results(results: dict, path: Path) -> Path:
     return path
 
 
-def calibrate_bandwidth(matcher: Matcher, data: Dataset, *, pairs: int = 16, points: int = 40, seed: int = 0) -> float:
+def calibrate_bandwidth(matcher: Matcher, data: Dataset, *, pairs: int = 8, points: int = 80, seed: int = 0) -> float:
     """The heatmap bandwidth with the least mean error on ``data``: contrastive descriptors have no scale.
 
     Leaves it set on the matcher and returns it (descriptor units).
@@ -115,7 +115,7 @@ def calibrate_bandwidth(matcher: Matcher, data: Dataset, *, pairs: int = 16, poi
 
 
 def calibrate_temperature(
-    matcher: Matcher, data: Dataset, *, pairs: int = 64, points: int = 40, seed: int = 0
+    matcher: Matcher, data: Dataset, *, pairs: int = 32, points: int = 40, seed: int = 0
 ) -> float:
     """The temperature with the least negative log-likelihood of the true matches on ``data`` (Guo et al., ICML 2017).
 
@@ -124,23 +124,29 @@ def calibrate_temperature(
     chosen = sample_pairs(data.episode, pairs, np.random.default_rng(seed))
     descriptors, points = _describe(matcher, data, np.unique(chosen)), choose_points(points)
     orbits = data.group(matcher.config.group).permutations[:, points].T  # (S, G)
+    matcher.temperature, logits, true = 1.0, [], []
+    for first, second in chosen:
+        asked = data.visible[first, points]
+        xy = torch.from_numpy(data.xy[first, points[asked]])
+        heatmap = matcher.compute_heatmaps(descriptors[first], descriptors[second], xy, data.size)
+        logits.append(heatmap.flatten(1).clamp(min=1e-38).log())
+        true.append(_find_cells(data.xy[second][orbits[asked]], data.size, heatmap.shape[-2:]))
+    logits, true = torch.cat(logits), torch.from_numpy(np.concatenate(true)).to(logits[0].device)
 
     def measure(log_temperature: float) -> float:
-        matcher.temperature, losses = float(np.exp(log_temperature)), []
-        for first, second in chosen:
-            asked = data.visible[first, points]
-            xy = torch.from_numpy(data.xy[first, points[asked]])
-            heatmap = matcher.compute_heatmaps(descriptors[first], descriptors[second], xy, data.size)
-            scale = np.array(heatmap.shape[:0:-1]) / data.size  # cells a px
-            cell = ((data.xy[second][orbits[asked]] + 0.5) * scale).astype(int)  # (S, G, 2)
-            cell = torch.from_numpy(cell.clip(0, np.array(heatmap.shape[:0:-1]) - 1)).to(heatmap.device)
-            mass = heatmap[torch.arange(len(xy), device=heatmap.device)[:, None], cell[..., 1], cell[..., 0]]
-            losses.append(-mass.clamp(min=1e-12).log().mean(1))
-        return float(torch.cat(losses).mean())
+        return -float((logits / np.exp(log_temperature)).log_softmax(-1).gather(1, true).mean())
 
     best = minimize_scalar(measure, bounds=np.log(TEMPERATURES), method="bounded", options={"xatol": 0.01})
     matcher.temperature = float(np.exp(best.x))
     return matcher.temperature
+
+
+def _find_cells(xy: np.ndarray, size: tuple[int, int], shape: tuple[int, int]) -> np.ndarray:
+    """Number (…) in a (h, w) grid of the cell that each pixel (…, 2) of an image of ``size`` lies in, or is nearest."""
+    column, row = (
+        np.floor((xy[..., k] + 0.5) * (shape[1 - k] / size[k])).astype(int).clip(0, shape[1 - k] - 1) for k in (0, 1)
+    )
+    return row * shape[1] + column
 
 
 def choose_points(count: int) -> np.ndarray:

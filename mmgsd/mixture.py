@@ -72,7 +72,7 @@ def fit_modes(heatmap: Tensor, n: int | str | Tensor, xs: Tensor, ys: Tensor, *,
 
 def _fit(mass: Tensor, n: Tensor, n_max: int, grid: tuple[int, int], cycles: int) -> Tensor:
     """State of the fit to (S, C) mass, in chunks of queries: memory stays bounded, and a chunk in the cache."""
-    size = max(1, CHUNK[mass.device.type] // (n_max * mass.shape[1]))
+    size = max(1, CHUNK.get(mass.device.type, CHUNK["cpu"]) // (n_max * mass.shape[1]))
     cells = _describe_cells(grid, mass.device)
     states = []
     for part, count in zip(mass.split(size), n.split(size), strict=True):

@@ -10,9 +10,9 @@ from pathlib import Path
 PAPER = {"cloth": 32.4, "rope": 31.3}  # px, MMGSD's RMSE as the paper reports it
 LABELS = {
     "mmgsd": "**MMGSD** (ours)", "spcl": "SPCL", "unimodal": "Unimodal", "pcl": "PCL",
-    "sift": "SIFT", "orb": "ORB", "random": "random points", "centre": "object's centre",
+    "sift": "SIFT", "orb": "ORB", "akaze": "AKAZE", "daisy": "DAISY", "surf": "SURF",
+    "random": "random points", "centre": "object's centre",
 }  # fmt: skip
-BEGIN, END = "<!-- results: made by `make readme` -->", "<!-- end of results -->"
 
 
 def make_results_table(results: dict[str, dict[str, dict[str, float]]]) -> str:
@@ -22,6 +22,8 @@ def make_results_table(results: dict[str, dict[str, dict[str, float]]]) -> str:
         "|---|---|---|---|---|---|---|",
     ]
     for method, label in LABELS.items():
+        if not all(method in results[object] for object in PAPER):
+            continue  # SURF is not in every OpenCV
         rows = [results[object][method] for object in PAPER]
         cells = [f"{r['rmse_mean']:.1f} | {r['median']:.1f} | {100 * r['pck@20px']:.0f} %" for r in rows]
         lines.append(f"| {label} | {' | '.join(cells)} |")
@@ -29,16 +31,46 @@ def make_results_table(results: dict[str, dict[str, dict[str, float]]]) -> str:
     return "\n".join(lines)
 
 
-def update_readme(readme: Path, table: str) -> None:
-    """Replace what stands between the two markers; ValueError where the markers are missing."""
+def make_uncertainty_table(results: dict[str, dict[str, dict[str, dict[str, float | None]]]]) -> str:
+    """Markdown from {"calibrated" or "temperature 1": {object: {method: {measure: value}}}}, a method a row."""
+    lines = [
+        "| | | Spearman | AURC px | 90 % ellipses hold | ECE | AUROC occluded |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for name, methods in results["calibrated"].items():
+        for method, label in LABELS.items():
+            if method in methods:
+                before = results["temperature 1"][name].get(method)
+                lines.append(f"| {name} | {label} | {_format_uncertainty(methods[method], before)} |")
+    return "\n".join(lines)
+
+
+def _format_uncertainty(after: dict[str, float | None], before: dict[str, float | None] | None) -> str:
+    def change(key: str, scale: float, form: str) -> str:
+        values = [after[key]] if before is None else [before[key], after[key]]
+        return " → ".join("–" if v is None else format(scale * v, form) for v in values)
+
+    measures = [f"{after['spearman']:.2f}", f"{after['aurc']:.1f} of {after['aurc_random']:.1f}"]
+    measures += [change("coverage@90%", 100, ".0f") + " %", change("ece", 1, ".2f")]
+    return " | ".join([*measures, "–" if after["auroc_occluded"] is None else f"{after['auroc_occluded']:.2f}"])
+
+
+def update_readme(readme: Path, name: str, table: str) -> None:
+    """Replace what stands between the two markers of ``name``; ValueError where the markers are missing."""
+    begin, end = f"<!-- {name}: made by `make readme` -->", f"<!-- end of {name} -->"
     text = readme.read_text()
-    if text.count(BEGIN) != 1 or text.count(END) != 1:
-        raise ValueError(f"{readme} must hold {BEGIN!r} and {END!r} once each")
-    head, rest = text.split(BEGIN)
+    if text.count(begin) != 1 or text.count(end) != 1:
+        raise ValueError(f"{readme} must hold {begin!r} and {end!r} once each")
+    head, rest = text.split(begin)
     aside = readme.with_suffix(".tmp")
-    aside.write_text(f"{head}{BEGIN}\n{table}\n{END}{rest.split(END)[1]}")
+    aside.write_text(f"{head}{begin}\n{table}\n{end}{rest.split(end)[1]}")
     os.replace(aside, readme)
 
 
 if __name__ == "__main__":
-    update_readme(Path(sys.argv[2]), make_results_table(json.loads((Path(sys.argv[1]) / "rmse.json").read_text())))
+    folder, target = Path(sys.argv[1]), Path(sys.argv[2])
+    for part, file, make in (
+        ("results", "rmse.json", make_results_table),
+        ("uncertainty", "uncertainty.json", make_uncertainty_table),
+    ):
+        update_readme(target, part, make(json.loads((folder / file).read_text())))

@@ -22,5 +22,5 @@ def test_the_smoke_experiment_runs_from_any_folder_and_draws_every_figure(tmp_pa
     done = run_papermill(tmp_path)
     assert done.returncode == 0, done.stderr[-3000:]
     drawn = {path.name for path in (RUN_ALL.parents[1] / "figures" / "smoke").iterdir()}
-    names = ("teaser", "combined", "rmse_pdf", "spatial_rmse", "sigma_ablation")
+    names = ("teaser", "combined", "rmse_pdf", "spatial_rmse", "sigma_ablation", "risk_coverage", "calibration")
     assert {f"{name}.{kind}" for name in names for kind in ("pdf", "png")} <= drawn

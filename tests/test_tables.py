@@ -1,13 +1,16 @@
-"""The README's table says what the results say."""
+"""The README's tables say what the results say."""
+
+from pathlib import Path
 
 import pytest
 
-from mmgsd.tables import BEGIN, END, LABELS, make_results_table, update_readme
+from mmgsd.tables import LABELS, make_results_table, make_uncertainty_table, update_readme
 
 RESULTS = {
     object: {method: {"rmse_mean": 10.0 * i + 1, "median": 5.0, "pck@20px": 0.5} for i, method in enumerate(LABELS)}
     for object in ("cloth", "rope")
 }
+BEGIN, END = "<!-- results: made by `make readme` -->", "<!-- end of results -->"
 
 
 def test_every_method_has_a_row_with_its_numbers() -> None:
@@ -17,16 +20,32 @@ def test_every_method_has_a_row_with_its_numbers() -> None:
     assert "32.4" in rows[-1] and "31.3" in rows[-1]
 
 
-def test_update_replaces_only_what_stands_between_the_markers(tmp_path) -> None:
+def test_a_method_that_was_not_at_hand_has_no_row() -> None:
+    results = {name: {m: v for m, v in methods.items() if m != "surf"} for name, methods in RESULTS.items()}
+    assert "SURF" not in make_results_table(results) and "SURF" in make_results_table(RESULTS)
+
+
+def test_uncertainty_before_and_after() -> None:
+    after = {"spearman": 0.4, "aurc": 30.0, "aurc_random": 50.0, "coverage@90%": 0.88, "ece": 0.03}
+    before = after | {"coverage@90%": 0.5, "ece": 0.2, "auroc_occluded": 0.9}
+    after = {"mmgsd": after | {"auroc_occluded": 0.7}, "sift": after | {"auroc_occluded": None}}
+    table = make_uncertainty_table({"calibrated": {"rope": after}, "temperature 1": {"rope": {"mmgsd": before}}})
+    assert table.splitlines()[2:] == [
+        "| rope | **MMGSD** (ours) | 0.40 | 30.0 of 50.0 | 50 → 88 % | 0.20 → 0.03 | 0.70 |",
+        "| rope | SIFT | 0.40 | 30.0 of 50.0 | 88 % | 0.03 | – |",
+    ]
+
+
+def test_update_replaces_only_what_stands_between_the_markers(tmp_path: Path) -> None:
     path = tmp_path / "README.md"
     path.write_text(f"before\n{BEGIN}\nold\n{END}\nafter\n")
-    update_readme(path, "new")
+    update_readme(path, "results", "new")
     assert path.read_text() == f"before\n{BEGIN}\nnew\n{END}\nafter\n"
 
 
-def test_a_readme_without_markers_is_left_alone(tmp_path) -> None:
+def test_a_readme_without_markers_is_left_alone(tmp_path: Path) -> None:
     path = tmp_path / "README.md"
     path.write_text("text")
     with pytest.raises(ValueError, match="must hold"):
-        update_readme(path, "new")
+        update_readme(path, "results", "new")
     assert path.read_text() == "text"
