@@ -21,7 +21,7 @@ from mmgsd.matching import Match, check_question, make_match
 
 BASELINES = ("sift", "orb", "akaze", "daisy", "surf")
 BINARY = ("orb", "akaze")  # compared by Hamming distance
-STRIDE_PX = 8  # between the candidates on the object
+STRIDE_PX = 16  # between the candidates on the object: about a cell of the trained networks
 SHARPNESS = 2.0  # logits fall by this where the squared distance grows by its std over the object
 PAD_PX = 80  # reflected border: every window lies inside the padded image, so no detector drops a keypoint
 ANGLE_BINS, ANGLE_CELL_PX = 36, 4  # SIFT's orientation histogram; its gradients are pooled to cells of 4 px

@@ -26,7 +26,6 @@ from mmgsd.network import compute_cell_centres
 BASELINES = list_baselines()  # hand-made descriptors that this OpenCV has
 CHANCE = ("centre", "random")
 BANDWIDTHS = (1 / 64, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2)  # of a contrastive heatmap, in margins
-
 TEMPERATURES = (0.1, 10.0)  # range in which the calibrated one is sought
 
 Answer = Callable[[int, int, np.ndarray, np.ndarray], tuple[Mixture, Tensor]]

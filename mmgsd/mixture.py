@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-CYCLES, ROUND = 60, 3  # of three EM steps and a leap, at most; a query at rest is left alone after each round
+CYCLES, ROUND = 30, 3  # of three EM steps and a leap, at most; a query at rest is left alone after each round
 TOLERANCE_CELLS = 0.005  # the most that a mode at rest moves in a round
 LEAP = 16.0  # the longest leap, in steps
 KERNEL_CELLS = 2.0  # std of the kernel that finds the initial peaks
@@ -89,10 +89,8 @@ def _interpolate(mass: Tensor, grid: tuple[int, int]) -> Tensor:
     matrices = []
     for count in grid:
         matrix = sum(share * torch.eye(count + 2)[k : k + count] for k, share in enumerate(SPREAD))
-        matrix[:, 1], matrix[:, -2] = (
-            matrix[:, 1] + matrix[:, 0],
-            matrix[:, -2] + matrix[:, -1],
-        )  # none leaves the image
+        matrix[:, 1] += matrix[:, 0]  # none leaves the image
+        matrix[:, -2] += matrix[:, -1]
         matrices.append(matrix[:, 1:-1].to(mass.device))
     return (matrices[0].T @ mass.view(-1, *grid) @ matrices[1]).flatten(1)
 

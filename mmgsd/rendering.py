@@ -99,9 +99,9 @@ def _connect(workers: int, scheduler: str) -> Iterator[Client]:
         with Client(scheduler) as client:
             yield client
         return
+    threads = workers or os.cpu_count()  # they only wait for the children
     with _unchanged_environment(), LocalCluster(
-        n_workers=workers or os.cpu_count(), threads_per_worker=1, host="127.0.0.1", dashboard_address=None,
-        silence_logs="ERROR",
+        n_workers=1, threads_per_worker=threads, processes=False, dashboard_address=None, silence_logs="ERROR",
     ) as local, Client(local) as client:  # fmt: skip
         yield client
 

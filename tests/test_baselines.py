@@ -17,6 +17,7 @@ from mmgsd.baselines import (
 
 HERE = BASELINES[:-1]  # SURF is not in every OpenCV
 SIZE = (240, 200)  # width, height
+STRIDE = 8  # px, finer than the default: the image is small
 CENTRE = np.array([119.5, 99.5])
 
 
@@ -53,7 +54,7 @@ def turn(image, xy, degrees):
 def test_heatmap_is_a_distribution_on_the_object(method, image, mask, xy):
     half = mask.copy()
     half[:, :100] = False
-    heatmap, grid = compute_baseline_heatmap(image, image, xy, half, method=method)
+    heatmap, grid = compute_baseline_heatmap(image, image, xy, half, method=method, stride=STRIDE)
     assert heatmap.shape == (len(xy), 25, 30)
     assert heatmap.dtype == np.float32
     assert grid.shape == (25, 30, 2)
@@ -64,7 +65,7 @@ def test_heatmap_is_a_distribution_on_the_object(method, image, mask, xy):
 
 @pytest.mark.parametrize("method", HERE)
 def test_an_image_matches_itself(method, image, mask, xy):
-    heatmap, grid = compute_baseline_heatmap(image, image, xy, mask, method=method)
+    heatmap, grid = compute_baseline_heatmap(image, image, xy, mask, method=method, stride=STRIDE)
     errors = np.linalg.norm(find_top(heatmap, grid) - xy, axis=1)
     assert np.median(errors) <= 8  # the cell's own extent
 
@@ -73,7 +74,7 @@ def test_an_image_matches_itself(method, image, mask, xy):
 @pytest.mark.parametrize("degrees", [35, 90, -140])
 def test_a_turned_image_matches(method, degrees, image, mask, xy):
     turned, true = turn(image, xy, degrees)
-    heatmap, grid = compute_baseline_heatmap(image, turned, xy, mask, method=method)
+    heatmap, grid = compute_baseline_heatmap(image, turned, xy, mask, method=method, stride=STRIDE)
     errors = np.linalg.norm(find_top(heatmap, grid) - true, axis=1)
     assert np.median(errors) <= 8
 
@@ -110,7 +111,7 @@ def test_no_point_is_dropped_at_the_border(method, image):
 @pytest.mark.parametrize("method", HERE)
 def test_a_plain_image_gives_a_uniform_heatmap(method, image, mask, xy):
     plain = np.full_like(image, 90)
-    heatmap, _ = compute_baseline_heatmap(plain, plain, xy[:3], mask, method=method)
+    heatmap, _ = compute_baseline_heatmap(plain, plain, xy[:3], mask, method=method, stride=STRIDE)
     np.testing.assert_allclose(heatmap, 1 / heatmap[0].size, rtol=0.02)  # DAISY's rounding
 
 
@@ -129,20 +130,20 @@ def test_grid_cells_lie_where_documented():
 
 
 def test_no_query_gives_an_empty_heatmap(image, mask):
-    heatmap, _ = compute_baseline_heatmap(image, image, np.zeros((0, 2)), mask, method="orb")
+    heatmap, _ = compute_baseline_heatmap(image, image, np.zeros((0, 2)), mask, method="orb", stride=STRIDE)
     assert heatmap.shape == (0, 25, 30)
 
 
 def test_surf_is_used_where_opencv_has_it(image, mask, xy, monkeypatch):
     monkeypatch.setattr(cv2, "xfeatures2d", SimpleNamespace(SURF_create=cv2.SIFT_create), raising=False)
-    heatmap, grid = compute_baseline_heatmap(image, image, xy, mask, method="surf")
+    heatmap, grid = compute_baseline_heatmap(image, image, xy, mask, method="surf", stride=STRIDE)
     assert np.median(np.linalg.norm(find_top(heatmap, grid) - xy, axis=1)) <= 8
 
 
 def test_surf_is_refused_where_opencv_lacks_it(image, mask, xy, monkeypatch):
     monkeypatch.delattr(cv2, "xfeatures2d", raising=False)
     with pytest.raises(ValueError, match="non-free modules.*'sift', 'orb', 'akaze', 'daisy'"):
-        compute_baseline_heatmap(image, image, xy, mask, method="surf")
+        compute_baseline_heatmap(image, image, xy, mask, method="surf", stride=STRIDE)
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,8 @@ def make_match(queries: int = 1, modes: int = 2, *, height: int = 40, width: int
     cells = rng.random((queries, height // 4, width // 4)).astype(np.float32)
     weights = np.full((queries, modes), 1 / modes)
     cells /= cells.sum((1, 2), keepdims=True)
-    return Match(*images, xy, centres, weights, covariances, np.full(queries, 7.25), cells)
+    entropy, outside = np.full(queries, 7.25), np.zeros(queries)
+    return Match(*images, xy, centres, weights, covariances, entropy, outside, cells)
 
 
 def make_queries(error: float = 20.0, points: int = 625) -> pd.DataFrame:
