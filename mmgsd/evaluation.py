@@ -51,7 +51,7 @@ def evaluate_model(
     matcher = Matcher.load(weights)
     if temperature is not None:
         matcher.temperature = temperature
-    answer = _model_answer(matcher, data)
+    answer = _model_answer(matcher, data, config)
     return _write(_ask(answer, data, config, group, progress, out.stem), out, question)
 
 
@@ -98,17 +98,27 @@ def write_results(results: dict, path: Path) -> Path:
     return path
 
 
+def measure_rmse(matcher: Matcher, data: Dataset, *, pairs: int = 60, points: int = 125, seed: int = 0) -> float:
+    """Mean RMSE (px) of the queries with a visible source: one number on images kept apart for validation."""
+    config = EvaluateConfig(pairs=pairs, points=points, seed=seed)
+    return _measure_rmse(_model_answer(matcher, data, config), matcher, data, config)
+
+
+def _measure_rmse(answer: Answer, matcher: Matcher, data: Dataset, config: EvaluateConfig) -> float:
+    queries = _ask(answer, data, config, matcher.config.group, False, "")
+    return float(queries.rmse_px[queries.visible].mean())
+
+
 def calibrate_bandwidth(matcher: Matcher, data: Dataset, *, pairs: int = 8, points: int = 80, seed: int = 0) -> float:
     """The heatmap bandwidth with the least mean error on ``data``: contrastive descriptors have no scale.
 
     Leaves it set on the matcher and returns it (descriptor units).
     """
     config, errors = EvaluateConfig(pairs=pairs, points=points, seed=seed), {}
-    answer = _model_answer(matcher, data)
+    answer = _model_answer(matcher, data, config)
     for bandwidth in (matcher.config.margin * b for b in BANDWIDTHS):
         matcher.bandwidth = bandwidth
-        queries = _ask(answer, data, config, matcher.config.group, False, "")
-        errors[bandwidth] = queries.rmse_px[queries.visible].mean()
+        errors[bandwidth] = _measure_rmse(answer, matcher, data, config)
     matcher.bandwidth = min(errors, key=errors.get)
     return matcher.bandwidth
 
@@ -155,7 +165,7 @@ def choose_points(count: int) -> np.ndarray:
 
 def _ask(answer: Answer, data: Dataset, config: EvaluateConfig, group: str, progress: bool, name: str) -> pd.DataFrame:
     """Ask ``answer`` every query and compare with the truth; one row a query."""
-    pairs = sample_pairs(data.episode, config.pairs, np.random.default_rng(config.seed))
+    pairs = _draw_pairs(data, config)
     symmetry, points = data.group(group), choose_points(config.points)
     orbits = [symmetry.distinct_modes(int(p)) for p in points]
     count = np.array([len(o) for o in orbits])
@@ -179,8 +189,13 @@ def _ask(answer: Answer, data: Dataset, config: EvaluateConfig, group: str, prog
     return pd.concat(frames, ignore_index=True)
 
 
-def _model_answer(matcher: Matcher, data: Dataset) -> Answer:
-    descriptors = _describe(matcher, data, np.arange(len(data)))
+def _draw_pairs(data: Dataset, config: EvaluateConfig) -> np.ndarray:
+    """(pairs, 2) images of different simulations."""
+    return sample_pairs(data.episode, config.pairs, np.random.default_rng(config.seed))
+
+
+def _model_answer(matcher: Matcher, data: Dataset, config: EvaluateConfig) -> Answer:
+    descriptors = _describe(matcher, data, np.unique(_draw_pairs(data, config)))
 
     def answer(first: int, second: int, xy: np.ndarray, n: np.ndarray) -> tuple[Mixture, Tensor]:
         heatmap = matcher.compute_heatmaps(descriptors[first], descriptors[second], torch.from_numpy(xy), data.size)

@@ -24,7 +24,7 @@ from mmgsd import losses
 from mmgsd.augmentation import Batch, load_training_images, make_batch
 from mmgsd.config import TrainConfig
 from mmgsd.dataset import Dataset, hold_out, load_dataset
-from mmgsd.evaluation import calibrate_bandwidth, calibrate_temperature
+from mmgsd.evaluation import calibrate_bandwidth, calibrate_temperature, measure_rmse
 from mmgsd.losses import CONTRASTIVE, MATCHES_OF_ONE
 from mmgsd.matching import Matcher
 from mmgsd.network import (
@@ -58,9 +58,11 @@ def compute_learning_rate(config: TrainConfig, step: int) -> float:
 
 def train_model(
     config: TrainConfig, dataset: Path, folder: Path, *,
-    overwrite: bool = False, device: str = "", progress: bool = True,
+    overwrite: bool = False, device: str = "", progress: bool = True, validate_every: int = 0,
 ) -> Path:  # fmt: skip
     """Train one model on the data set's training split; returns the path of its weights (safetensors).
+
+    The log (CSV) has a row a step; with ``validate_every`` steps, also the RMSE (px) on held-out simulations.
 
     A finished model is returned as it is, a killed run goes on from its last checkpoint and ends with the same weights.
     Raises ValueError where the data set is of another object or does not store the symmetry group.
@@ -75,7 +77,7 @@ def train_model(
         shutil.rmtree(folder)
     if data.object != config.object:
         raise ValueError(f"object is {config.object!r}, but {dataset} shows a {data.object}")
-    run = _Run(config, data, folder, torch.device(device or find_device()))
+    run = _Run(config, data, folder, torch.device(device or find_device()), validate_every)
     run.resume()
     bar = tqdm(range(run.step, config.steps), desc=config.name, disable=not progress, leave=False)
     for _ in bar:
@@ -114,8 +116,10 @@ def compute_loss(
 class _Run:
     """A training run that can be killed between any two steps."""
 
-    def __init__(self, config: TrainConfig, data: Dataset, folder: Path, device: torch.device) -> None:
-        self.config, self.folder = config, folder
+    def __init__(
+        self, config: TrainConfig, data: Dataset, folder: Path, device: torch.device, validate_every: int = 0
+    ) -> None:
+        self.config, self.folder, self.validate_every = config, folder, validate_every
         self.data, self.held_out = hold_out(data)  # the latter for calibration
         self.device, self.size = device, data.size
         group = data.group(config.group)
@@ -156,6 +160,8 @@ class _Run:
         self.step += 1
         self.seconds += time.perf_counter() - start
         self.log.append({"step": self.step, "loss": loss.item(), "seconds": round(self.seconds, 2)})
+        if self.validate_every and self.step % self.validate_every == 0:
+            self.log[-1]["rmse_px"] = round(self.validate(), 2)
         if self.seconds - self.saved_at >= CHECKPOINT_SECONDS:
             self.save()
         return loss.item()
@@ -166,6 +172,18 @@ class _Run:
         asked = batch.askable & (turn == self.step % PROTOTYPE_EVERY)
         sampled = sample_descriptors(descriptors, batch.xy, self.size)
         return compute_prototype_loss(sampled, asked, self.prototypes, self.permutations)
+
+    def make_matcher(self) -> Matcher:
+        """A matcher of the averaged weights; of a contrastive loss, its bandwidth calibrated."""
+        modes = len(self.permutations)
+        matcher = Matcher(self.average.module, self.config, modes=modes, size=self.size, device=self.device.type)
+        if self.config.method in CONTRASTIVE:
+            calibrate_bandwidth(matcher, self.held_out)
+        return matcher
+
+    def validate(self) -> float:
+        """RMSE (px) on the held-out simulations."""
+        return measure_rmse(self.make_matcher(), self.held_out)
 
     def save(self) -> None:
         """Write a checkpoint aside, then rename it."""
@@ -215,20 +233,19 @@ class _Run:
         """Write log and weights, the weights last: a folder that has them is finished."""
         self.folder.mkdir(parents=True, exist_ok=True)
         pd.DataFrame(self.log).to_csv(self.folder / LOG, index=False)
-        modes = len(self.permutations)
         metadata = {
             "format": "mmgsd-1",
             "config": json.dumps(dataclasses.asdict(self.config)),
             "size": json.dumps(self.size),
-            "modes": str(modes),
+            "modes": str(len(self.permutations)),
             "data": self.data.fingerprint,
             "images": str(len(self.data)),
             "seconds": f"{self.seconds:.1f}",
             "hardware": _name_hardware(self.device),
         }
-        matcher = Matcher(self.average.module, self.config, modes=modes, size=self.size, device=self.device.type)
-        if self.config.method in CONTRASTIVE:
-            metadata["bandwidth"] = repr(calibrate_bandwidth(matcher, self.held_out))
+        matcher = self.make_matcher()
+        if matcher.bandwidth is not None:
+            metadata["bandwidth"] = repr(matcher.bandwidth)
         metadata["temperature"] = repr(calibrate_temperature(matcher, self.held_out))
         state = {name: value.contiguous() for name, value in self.average.module.state_dict().items()}
         aside = weights.with_suffix(".tmp")

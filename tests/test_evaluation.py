@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -23,6 +24,7 @@ from mmgsd.evaluation import (
     evaluate_baseline,
     evaluate_model,
     load_queries,
+    measure_rmse,
     summarise,
     write_results,
 )
@@ -48,7 +50,7 @@ def write_weights(folder: Path, content: bytes = b"weights") -> Path:
 def answer_with_the_truth(group: str, shift: float) -> object:
     """Stands for a model that knows the labels: the true modes, moved by ``shift`` px along x."""
 
-    def make(matcher: object, data: Dataset) -> evaluation.Answer:
+    def make(matcher: object, data: Dataset, config: EvaluateConfig) -> evaluation.Answer:
         def answer(first: int, second: int, xy: np.ndarray, n: np.ndarray) -> tuple[Mixture, torch.Tensor]:
             modes = np.full((len(xy), n.max(), 2), np.nan)
             for row, point in enumerate(choose_points(CONFIG.points)):
@@ -224,6 +226,12 @@ def test_calibration_picks_a_candidate(cloth_dataset: Path, method: str) -> None
     bandwidth = calibrate_bandwidth(matcher, load_dataset(cloth_dataset), pairs=2, points=5)
     assert bandwidth == matcher.bandwidth
     assert bandwidth in [pytest.approx(0.6 * b) for b in BANDWIDTHS]
+
+
+def test_the_validation_error_is_that_of_the_queries(ask_oracle: object, cloth_dataset: Path) -> None:
+    ask_oracle(shift=7.0)  # from now on every model answers 7 px beside the truth
+    matcher = SimpleNamespace(config=TrainConfig())
+    assert measure_rmse(matcher, load_dataset(cloth_dataset), pairs=3, points=CONFIG.points) == pytest.approx(7, 1e-5)
 
 
 def test_temperature_of_overconfident_and_timid_heatmaps(cloth_dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:

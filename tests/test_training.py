@@ -61,7 +61,7 @@ training.train_model(config, Path(sys.argv[2]), Path(sys.argv[3]), device="cpu",
 """
 
 
-def train(config: TrainConfig, dataset: Path, folder: Path, **options: bool) -> Path:
+def train(config: TrainConfig, dataset: Path, folder: Path, **options: int) -> Path:
     return train_model(config, dataset, folder, device="cpu", progress=False, **options)
 
 
@@ -73,6 +73,17 @@ def train_and_kill(config: TrainConfig, dataset: Path, folder: Path) -> None:
         assert child.stdout.readline() == "in the middle of a step\n"
         child.kill()
     assert child.returncode == -signal.SIGKILL
+
+
+def test_the_log_holds_the_validation(cloth_dataset: Path, tmp_path: Path) -> None:
+    weights = train(dataclasses.replace(TINY, method="spcl"), cloth_dataset, tmp_path / "watched", validate_every=2)
+    rmse = pd.read_csv(tmp_path / "watched" / LOG).rmse_px
+    assert rmse.notna().tolist() == [False, True, False]
+    assert 0 < rmse[1] < 485
+    other = train(dataclasses.replace(TINY, method="spcl"), cloth_dataset, tmp_path / "unwatched")
+    assert "rmse_px" not in pd.read_csv(other.with_name(LOG))
+    for name, value in load_file(weights).items():  # watching changes nothing
+        torch.testing.assert_close(load_file(other)[name], value, rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -1,0 +1,97 @@
+"""What a number of minutes of training buys: ``python tests/bench/bench_learning.py --minutes 3 12``.
+
+For each budget one MMGSD model of the preset's data is trained from the start, in as many steps as fit (the pace is
+measured first), and validated on the training simulations that `hold_out` keeps apart: never on test images. Settings
+of `TrainConfig` can be changed, as in ``input_px=160 batch=24``. Every run is a row of
+``data/results/experiments.csv``; one that was interrupted goes on. Run it alone: a second busy process slows torch
+down several times.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import dataclasses
+import datetime
+import subprocess
+import tempfile
+from pathlib import Path
+
+import pandas as pd
+
+from mmgsd.config import METHODS, OBJECTS, Paths, TrainConfig, find_root, load_preset
+from mmgsd.dataset import hold_out, load_dataset
+from mmgsd.evaluation import measure_rmse
+from mmgsd.matching import Matcher
+from mmgsd.training import LOG, load_metadata, train_model
+
+PACE_STEPS = 16  # steps that the pace is measured on, the first quarter left out
+
+
+def parse_changes(words: list[str]) -> dict[str, object]:
+    """``name=value`` words as fields of `TrainConfig`, of their types."""
+    kinds = {field.name: {"int": int, "float": float, "bool": bool}.get(str(field.type), str)
+             for field in dataclasses.fields(TrainConfig)}  # fmt: skip
+    changes = {}
+    for word in words:
+        name, _, value = word.partition("=")
+        if name not in kinds:
+            raise SystemExit(f"{name!r} is no setting: choose among {', '.join(kinds)}")
+        changes[name] = value == "True" if kinds[name] is bool else kinds[name](value)
+    return changes
+
+
+def measure_pace(config: TrainConfig, dataset: Path) -> float:
+    """Seconds a step."""
+    with tempfile.TemporaryDirectory() as folder:
+        train_model(dataclasses.replace(config, steps=PACE_STEPS), dataset, Path(folder), progress=False)
+        seconds = pd.read_csv(Path(folder) / LOG).seconds.diff()
+    return float(seconds[PACE_STEPS // 4 :].median())
+
+
+def record(row: dict[str, object], path: Path) -> None:
+    """Append a row to the log of experiments."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    new = not path.is_file()
+    with path.open("a", newline="") as file:
+        writer = csv.DictWriter(file, row)
+        if new:
+            writer.writeheader()
+        writer.writerow(row)
+
+
+def main() -> None:
+    """Train, validate, print and record each budget; the last line is the one to compare."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--preset", default="paper")
+    parser.add_argument("--object", default="cloth", choices=OBJECTS)
+    parser.add_argument("--method", default="mmgsd", choices=METHODS)
+    parser.add_argument("--minutes", type=float, nargs="+", default=[3.0, 12.0])
+    parser.add_argument("changes", nargs="*", metavar="name=value", help="settings of TrainConfig")
+    asked = parser.parse_args()
+    paths = Paths(find_root(), asked.preset)
+    config = load_preset(asked.preset).method(asked.object, asked.method)
+    config, dataset = dataclasses.replace(config, **parse_changes(asked.changes)), paths.dataset(asked.object)
+    held_out = hold_out(load_dataset(dataset, "train"))[1]
+    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True).stdout.strip()
+    pace, results = measure_pace(config, dataset), []
+    for minutes in asked.minutes:
+        # two digits: an interrupted run is found again although the pace is never the same
+        steps = int(float(f"{max(1.0, 60 * minutes / pace):.2g}"))
+        run = dataclasses.replace(config, steps=steps)
+        weights = train_model(run, dataset, paths.generated / "experiments" / run.name, validate_every=steps // 4)
+        note, rmse = load_metadata(weights), measure_rmse(Matcher.load(weights), held_out)
+        taken = float(note["seconds"]) / 60
+        row = {
+            "date": datetime.date.today().isoformat(), "commit": commit, "preset": asked.preset, "object": asked.object,
+            "method": asked.method, "setting": " ".join(asked.changes), "steps": steps, "minutes": f"{taken:.1f}",
+            "images_seen": steps * run.batch, "rmse_px": f"{rmse:.1f}", "hardware": note["hardware"],
+        }  # fmt: skip
+        record(row, paths.root / "data" / "results" / "experiments.csv")
+        results.append(f"{rmse:.1f} px in {taken:.1f} min")
+        print(", ".join(f"{name} {value}" for name, value in row.items() if value != ""), flush=True)
+    print(f"{asked.object}: " + ", ".join(results))
+
+
+if __name__ == "__main__":
+    main()
