@@ -3,13 +3,13 @@
 from typing import Any
 
 __version__ = "0.1.0"
-__all__ = ["Matcher"]
+__all__ = ["Matcher", "load"]
 
 
 def __getattr__(name: str) -> Any:
     """Import torch only where it is used: the rendering's child processes do without it."""
-    if name == "Matcher":
-        from mmgsd.matching import Matcher
+    if name in __all__:
+        from mmgsd import matching
 
-        return Matcher
+        return getattr(matching, name)
     raise AttributeError(f"module 'mmgsd' has no attribute {name!r}")

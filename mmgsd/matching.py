@@ -13,7 +13,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from mmgsd.config import TrainConfig, from_dict
+from mmgsd.config import OBJECTS, TrainConfig, find_root, from_dict
 from mmgsd.losses import CONTRASTIVE, compute_squared_distances
 from mmgsd.mixture import Mixture, fit_modes
 from mmgsd.network import (
@@ -179,6 +179,18 @@ class Matcher:
         cells = self.compute_heatmaps(descriptors[0], descriptors[1], torch.from_numpy(points), size0)
         centres = compute_cell_centres(size1, cells.shape[-2:])
         return make_match(image0, image1, points, cells, centres, self.modes if n is None else n)
+
+
+def load(weights: Path | str, *, device: str = "") -> Matcher:
+    """A `Matcher` with weights that come with the repository (``"cloth"``, ``"rope"``), or with those of a file.
+
+    FileNotFoundError where there are none; ValueError for a file that is damaged or not ours.
+    """
+    if str(weights) in OBJECTS:
+        weights = find_root() / "data" / "weights" / f"{weights}.safetensors"
+    elif not Path(weights).is_file():
+        raise FileNotFoundError(f"{weights} must be a safetensors file or one of {', '.join(map(repr, OBJECTS))}")
+    return Matcher.load(weights, device=device)
 
 
 def make_match(

@@ -20,6 +20,7 @@ class PyramidNetwork(nn.Module):
     """EfficientNet-Lite0 trunk with a feature pyramid; (B, 3, H, W) in [0, 1] to (B, D, H / 4, W / 4)."""
 
     stride = 4
+    reduced_precision = True  # bfloat16 where that is faster
 
     def __init__(self, descriptor_dim: int, *, width: int = 96, pretrained: bool = True) -> None:
         super().__init__()
@@ -46,11 +47,14 @@ class PyramidNetwork(nn.Module):
         """Dense descriptors, not normalised: their distance carries the temperature."""
         x = (image - self.mean) / self.std  # (B, 3, H, W)
         # a CPU gains from bf16 in dense 3 x 3 convolutions and loses in the trunk's depthwise ones; a GPU gains in all
-        with torch.autocast(image.device.type, torch.bfloat16, enabled=image.device.type != "cpu"):
+        with self._autocast(image, image.device.type != "cpu"):
             features = self._encode(x)
-        with torch.autocast(image.device.type, torch.bfloat16, enabled=True):
+        with self._autocast(image):
             x = self._decode(features)
         return self.head(x.float())
+
+    def _autocast(self, image: Tensor, wanted: bool = True) -> torch.autocast:
+        return torch.autocast(image.device.type, torch.bfloat16, enabled=wanted and self.reduced_precision)
 
     def _encode(self, x: Tensor) -> list[Tensor]:
         x = self.trunk._swish(self.trunk._bn0(self.trunk._conv_stem(x)))
@@ -76,6 +80,7 @@ class ResNet34Network(nn.Module):
     """
 
     stride = 1
+    reduced_precision = True
 
     def __init__(self, descriptor_dim: int) -> None:
         super().__init__()
@@ -85,7 +90,7 @@ class ResNet34Network(nn.Module):
 
     def forward(self, image: Tensor) -> Tensor:
         """(B, 3, H, W) in [0, 1] to (B, D, H, W)."""
-        with torch.autocast(image.device.type, torch.bfloat16, enabled=True):
+        with torch.autocast(image.device.type, torch.bfloat16, enabled=self.reduced_precision):
             x = self.trunk((image - self.mean) / self.std)  # (B, 512, H / 8, W / 8)
         return F.interpolate(self.head(x.float()), image.shape[-2:], mode="bilinear", align_corners=False)
 
