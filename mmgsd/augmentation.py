@@ -27,6 +27,7 @@ class TrainingImages:
     xy: np.ndarray  # (N, P, 2) px
     visible: np.ndarray  # (N, P) bool
     size: tuple[int, int]  # full (W, H) px
+    mirror: np.ndarray | None = None  # (P,) where each point goes in a mirror image
 
 
 @dataclass(frozen=True)
@@ -105,25 +106,34 @@ def load_training_images(data: Dataset, input_px: int, *, indices: np.ndarray | 
 
     with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
         images, masks = zip(*pool.map(load, indices), strict=True)
-    return TrainingImages(list(images), list(masks), data.xy[indices], data.visible[indices], data.size)
+    labels = data.xy[indices], data.visible[indices]
+    return TrainingImages(list(images), list(masks), *labels, data.size, data.mirror)
 
 
 def make_batch(
     images: TrainingImages, indices: np.ndarray, config: TrainConfig, rng: np.random.Generator, device: torch.device
 ) -> Batch:
-    """Augment the images ``indices`` (B,), labels with them, and move them to the device."""
+    """Augment the images ``indices`` (B,), labels with them, and move them to the device.
+
+    Half of them are mirrored where the object has a mirror image.
+    """
     size = compute_input_size(images.size, config.input_px)
-    identity = np.eye(2, 3)
+    visible = images.visible[indices].copy()  # (B, P)
     pixels, masks, points = [], [], []
-    for index in indices:
-        affine = sample_affine(images.size, rng, rotate=config.rotate) if config.augment else identity
+    for k, index in enumerate(indices):
+        affine, xy = np.eye(2, 3), images.xy[index]
+        if config.augment:
+            affine = sample_affine(images.size, rng, rotate=config.rotate)
+            if images.mirror is not None and rng.random() < 0.5:
+                affine = affine @ [[-1, 0, images.size[0] - 1], [0, 1, 0], [0, 0, 1]]
+                xy, visible[k] = xy[images.mirror], visible[k][images.mirror]
         image = warp_image(images.images[index], affine, images.size, size)
         pixels.append(jitter_colours(image, rng) if config.augment else image)
         masks.append(warp_image(images.masks[index], affine, images.size, size) > 127)
-        points.append(warp_points(images.xy[index], affine))
+        points.append(warp_points(xy, affine))
     xy = np.stack(points)
     inside = np.all((xy > -0.5) & (xy < np.array(images.size) - 0.5), axis=-1)
     image = torch.from_numpy(np.stack(pixels)).to(device).permute(0, 3, 1, 2).float() / 255
     tensors = (torch.from_numpy(a).to(device) for a in (np.stack(masks), xy.astype(np.float32)))
-    askable = torch.from_numpy(inside & images.visible[indices]).to(device)
+    askable = torch.from_numpy(inside & visible).to(device)
     return Batch(image, *tensors, askable, torch.from_numpy(inside).to(device))

@@ -1,6 +1,6 @@
 """The data set on disk: its format, its checker and reader, and how pairs of images are drawn from it.
 
-dataset.json      object, image size, symmetry groups, seed, versions, number of images of each split
+dataset.json      object, image size, symmetry groups, mirror (optional), seed, versions, number of images of each split
 labels.parquet    one row an image: file, mask, split, episode, view, xy, visible, intrinsics, camera_pose, state …
 images/*.webp     lossless colour images          masks/*.png    1-bit object masks
 """
@@ -84,6 +84,16 @@ class Dataset:
         if name not in stored:
             raise ValueError(f"group must be one of {', '.join(map(repr, stored))} for this data set, got {name!r}")
         return SymmetryGroup(name, np.asarray(stored[name]))
+
+    @property
+    def mirror(self) -> np.ndarray | None:
+        """Where each material point (625,) goes in a mirror image, None for an object that has no mirror image."""
+        if self.info.get("mirror") is None:
+            return None
+        points = np.asarray(self.info["mirror"])
+        if not np.array_equal(np.sort(points), np.arange(N_POINTS)):
+            raise DatasetError(f"{self.folder / 'dataset.json'}: mirror must hold each of 0 to {N_POINTS - 1} once")
+        return points
 
     def load_image(self, index: int) -> np.ndarray:
         """(H, W, 3) uint8; DatasetError where the file is missing, truncated or of another size."""

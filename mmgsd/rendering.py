@@ -26,7 +26,7 @@ from tqdm.auto import tqdm
 
 from mmgsd.config import DEFAULT_GROUP, RenderConfig
 from mmgsd.dataset import FORMAT, SPLITS, load_dataset
-from mmgsd.symmetry import GRID_GROUPS, LINE_GROUPS, load_group
+from mmgsd.symmetry import GRID_GROUPS, LINE_GROUPS, load_group, load_mirror
 
 IMAGES_A_BATCH = 30  # a child process ends after about so many, which bounds its memory
 GROUPS = {"cloth": GRID_GROUPS, "rope": LINE_GROUPS}
@@ -164,6 +164,7 @@ def _assemble(config: RenderConfig, partial: Path) -> Path:
         "config": dataclasses.asdict(config),
         "versions": {name: importlib.metadata.version(name) for name in ("bpy", "numpy", "pillow")},
         "symmetry": groups,
+        "mirror": load_mirror(config.object).tolist(),
     }
     (folder / "dataset.json").write_text(json.dumps(info))
     return folder

@@ -119,6 +119,18 @@ def load_group(object: str, name: str) -> SymmetryGroup:
     return grid_group(name) if object == "cloth" else line_group(name)
 
 
+def load_mirror(object: str) -> np.ndarray:
+    """Where each material point (625,) of a ``cloth`` or ``rope`` goes in a mirror image of it, seen from above.
+
+    No symmetry of one shape: the mirror image of a cloth shows another cloth, whose columns count backwards; that of a
+    rope another rope, its points in the same order. ValueError for an unknown object.
+    """
+    _check_name("object", object, OBJECTS)
+    points = np.arange(N_POINTS)
+    side = round(N_POINTS**0.5)
+    return points.reshape(side, side)[:, ::-1].ravel() if object == "cloth" else points
+
+
 def _check_name(argument: str, value: str, accepted: tuple[str, ...]) -> None:
     if value not in accepted:
         raise ValueError(f"{argument} must be one of {', '.join(map(repr, accepted))}, got {value!r}")

@@ -16,7 +16,7 @@ import pytest
 
 from mmgsd.config import DEFAULT_GROUP, IMAGE_SIZE
 from mmgsd.dataset import FORMAT, encode_image, encode_mask
-from mmgsd.symmetry import GRID_GROUPS, LINE_GROUPS, load_group
+from mmgsd.symmetry import GRID_GROUPS, LINE_GROUPS, load_group, load_mirror
 
 os.environ.setdefault("MPLBACKEND", "Agg")  # no window, and before anything imports matplotlib
 
@@ -71,6 +71,7 @@ def write_tiny_dataset(parent: Path, *, object: str = "cloth", n_train: int = 4,
         "object": object,
         "size": [width, height],
         "symmetry": {name: load_group(object, name).permutations.tolist() for name in groups},
+        "mirror": load_mirror(object).tolist(),
         "default_group": DEFAULT_GROUP[object],
         "config": {},
         "images": {"train": n_train, "test": n_test},

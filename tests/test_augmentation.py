@@ -2,11 +2,29 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
+import torch
 
-from mmgsd.augmentation import compute_scaling, jitter_colours, sample_affine, warp_image, warp_points
+from mmgsd import augmentation
+from mmgsd.augmentation import (
+    compute_scaling,
+    jitter_colours,
+    load_training_images,
+    make_batch,
+    sample_affine,
+    warp_image,
+    warp_points,
+)
+from mmgsd.config import TrainConfig
+from mmgsd.dataset import load_dataset
+
+CONFIG = TrainConfig(input_px=128)
 
 RESOLUTIONS = [  # full image, the copy in memory, the network's input
     ((485, 485), (485, 485), (485, 485)),
@@ -107,3 +125,31 @@ def test_randomness_is_the_generators() -> None:
     )
     np.testing.assert_array_equal(one[0], two[0])
     np.testing.assert_array_equal(one[1], two[1])
+
+
+@pytest.mark.parametrize("object", ["cloth", "rope"])
+def test_labels_follow_a_mirrored_image(
+    tiny_dataset: Callable[..., Path], monkeypatch: pytest.MonkeyPatch, object: str
+) -> None:
+    monkeypatch.setattr(augmentation, "jitter_colours", lambda image, rng: image)
+    images = load_training_images(load_dataset(tiny_dataset(object=object)), 128)
+    point, rng, mirrored = 260, np.random.default_rng(0), set()
+    for image, xy in zip(images.images, images.xy, strict=True):
+        dot = draw_dot(xy[point], images.size)
+        image[:] = cv2.resize(dot, image.shape[1::-1], interpolation=cv2.INTER_AREA)[..., None]
+    for _ in range(12):
+        batch = make_batch(images, np.array([0]), CONFIG, rng, torch.device("cpu"))
+        shown = batch.image[0, 0].numpy()
+        labels = batch.xy[0, [point, images.mirror[point]]].numpy()
+        apart = [np.linalg.norm(find_dot(shown, images.size, xy) - xy) for xy in labels]
+        assert np.nanmin(apart) < 3
+        mirrored.add(int(np.nanargmin(apart)))
+    assert mirrored == ({0, 1} if object == "cloth" else {0})
+
+
+def test_without_a_mirror_nothing_is_mirrored(tiny_dataset: Callable[..., Path], rng: np.random.Generator) -> None:
+    images = dataclasses.replace(load_training_images(load_dataset(tiny_dataset()), 64), mirror=None)
+    for _ in range(8):  # three corners of a cloth keep their sense of rotation
+        xy = make_batch(images, np.array([0]), CONFIG, rng, torch.device("cpu")).xy[0].numpy()
+        (ax, ay), (bx, by) = xy[24] - xy[0], xy[600] - xy[0]
+        assert ax * by - ay * bx > 0

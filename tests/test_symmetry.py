@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mmgsd.symmetry import GRID_GROUPS, LINE_GROUPS, SymmetryGroup, grid_group, line_group, load_group
+from mmgsd.symmetry import GRID_GROUPS, LINE_GROUPS, SymmetryGroup, grid_group, line_group, load_group, load_mirror
 
 ORDERS = {"identity": 1, "c2": 2, "v4": 4, "c4": 4, "d4": 8}
 LOADED = [("cloth", name) for name in GRID_GROUPS] + [("rope", name) for name in LINE_GROUPS]
@@ -135,3 +135,15 @@ def test_points_outside_are_refused(points):
 def test_errors_name_what_is_accepted(call, message):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+def test_a_mirror_counts_a_cloths_columns_backwards_and_leaves_a_rope() -> None:
+    cloth = load_mirror("cloth")
+    assert cloth[[0, 1, 25, 624]].tolist() == [24, 23, 49, 600]
+    assert load_mirror("rope").tolist() == list(range(625))
+    for name in ("c2", "v4", "c4", "d4"):  # a mirrored orbit is the mirror image's orbit
+        group = load_group("cloth", name)
+        for point in (0, 7, 130, 312):
+            assert set(cloth[group.orbit(point)]) == set(group.orbit(cloth[point]))
+    with pytest.raises(ValueError, match="object must be one of 'cloth', 'rope', got 'towel'"):
+        load_mirror("towel")
