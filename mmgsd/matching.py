@@ -24,6 +24,7 @@ from mmgsd.network import (
     sample_descriptors,
 )
 
+QUARTERS = 4  # turns of an image whose descriptors are averaged: what noise they have differs
 RADIUS_PX = 20.0  # within which a robot's grasp still holds, unless the caller says otherwise
 
 
@@ -122,6 +123,7 @@ class Matcher:
         self.network = network.eval().to(self.device, memory_format=torch.channels_last)
         self.config, self.modes, self.size = config, modes, size
         self.temperature = temperature
+        self.turns = QUARTERS if config.rotate else 1  # what was trained upright knows only upright images
         self.bandwidth = config.margin / 4 if bandwidth is None and config.method in CONTRASTIVE else bandwidth
 
     @classmethod
@@ -149,11 +151,16 @@ class Matcher:
 
     @torch.inference_mode()
     def describe(self, images: list[np.ndarray]) -> Tensor:
-        """Descriptors (B, D, h, w) of B images (H, W, 3) uint8 of any sizes."""
+        """Descriptors (B, D, h, w) of B images (H, W, 3) uint8 of any sizes, the mean over quarter turns."""
         size = compute_input_size(self.size, self.config.input_px)
         small = np.stack([cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in images])
         batch = torch.from_numpy(small).to(self.device).permute(0, 3, 1, 2).float() / 255
-        return self.network(batch.contiguous(memory_format=torch.channels_last))
+        return sum(self._describe_turned(batch, k) for k in range(self.turns)) / self.turns
+
+    def _describe_turned(self, batch: Tensor, quarters: int) -> Tensor:
+        """Descriptors of images seen after so many quarter turns, turned back."""
+        turned = batch.rot90(quarters, (2, 3)).contiguous(memory_format=torch.channels_last)
+        return self.network(turned).rot90(-quarters, (2, 3))
 
     @torch.inference_mode()
     def compute_heatmaps(self, descriptors0: Tensor, descriptors1: Tensor, xy: Tensor, size: tuple[int, int]) -> Tensor:
