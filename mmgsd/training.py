@@ -134,8 +134,10 @@ class _Run:
         self.average = AveragedModel(self.network, multi_avg_fn=average, use_buffers=True)
         start = make_prototypes(self.data.xy, known, config.descriptor_dim, math.hypot(*data.size))
         self.prototypes = torch.nn.Parameter(start.to(device))
-        parameters = [*self.network.parameters(), self.prototypes]
-        self.optimiser = torch.optim.AdamW(parameters, lr=config.learning_rate, weight_decay=config.weight_decay)
+        self.trained = [p for p in self.network.parameters() if p.requires_grad]
+        self.optimiser = torch.optim.AdamW(
+            [*self.trained, self.prototypes], lr=config.learning_rate, weight_decay=config.weight_decay, fused=True
+        )
         self.step, self.seconds, self.saved_at, self.log = 0, 0.0, 0.0, []
 
     def advance(self) -> float:
@@ -154,7 +156,7 @@ class _Run:
             loss = loss + self.config.prototype_weight * self.compute_dense_loss(descriptors, batch)
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.network.parameters(), 5.0)
+        torch.nn.utils.clip_grad_norm_(self.trained, 5.0)
         self.optimiser.step()
         self.average.update_parameters(self.network)
         self.step += 1
@@ -217,9 +219,11 @@ class _Run:
             parts[part][rest] = value
         self.network.load_state_dict(parts["network"])
         self.average.load_state_dict(parts["average"])
-        state = {}
+        state, parameters = {}, self.optimiser.param_groups[0]["params"]
         for name, value in parts["optimiser"].items():
             index, field = name.split("/")
+            # the fused step takes for granted that moments lie in memory as their parameter does
+            value = torch.empty_like(parameters[int(index)]).copy_(value) if value.ndim else value
             state.setdefault(int(index), {})[field] = value
         self.optimiser.load_state_dict({**self.optimiser.state_dict(), "state": state})
         numbers = json.loads(metadata["numbers"])

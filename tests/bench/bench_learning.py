@@ -14,6 +14,7 @@ import csv
 import dataclasses
 import datetime
 import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
@@ -25,7 +26,7 @@ from mmgsd.evaluation import measure_rmse
 from mmgsd.matching import Matcher
 from mmgsd.training import LOG, load_metadata, train_model
 
-PACE_STEPS = 16  # steps that the pace is measured on, the first quarter left out
+PACE_STEPS = 20  # steps that the pace is measured on, after as many to warm up
 
 
 def parse_changes(words: list[str]) -> dict[str, object]:
@@ -44,9 +45,9 @@ def parse_changes(words: list[str]) -> dict[str, object]:
 def measure_pace(config: TrainConfig, dataset: Path) -> float:
     """Seconds a step."""
     with tempfile.TemporaryDirectory() as folder:
-        train_model(dataclasses.replace(config, steps=PACE_STEPS), dataset, Path(folder), progress=False)
+        train_model(dataclasses.replace(config, steps=2 * PACE_STEPS), dataset, Path(folder), progress=False)
         seconds = pd.read_csv(Path(folder) / LOG).seconds.diff()
-    return float(seconds[PACE_STEPS // 4 :].median())
+    return float(seconds[PACE_STEPS:].median())
 
 
 def record(row: dict[str, object], path: Path) -> None:
@@ -79,7 +80,8 @@ def main() -> None:
         # two digits: an interrupted run is found again although the pace is never the same
         steps = int(float(f"{max(1.0, 60 * minutes / pace):.2g}"))
         run = dataclasses.replace(config, steps=steps)
-        weights = train_model(run, dataset, paths.generated / "experiments" / run.name, validate_every=steps // 4)
+        folder, how = paths.generated / "experiments" / run.name, {"progress": sys.stderr.isatty()}
+        weights = train_model(run, dataset, folder, validate_every=steps // 4, **how)
         note, rmse = load_metadata(weights), measure_rmse(Matcher.load(weights), held_out)
         taken = float(note["seconds"]) / 60
         row = {
