@@ -94,7 +94,8 @@ def _draw(answer: Any, path: Path) -> None:
     from mmgsd.plots import plot_teaser
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    (answer.plot() if len(answer.xy) == 1 else plot_teaser({"": [answer]})).savefig(path)
+    figure = answer.plot() if len(answer.xy) == 1 else plot_teaser({"": [answer[k] for k in range(len(answer.xy))]})
+    figure.savefig(path)
 
 
 def _read_image(path: Path) -> np.ndarray:

@@ -82,8 +82,12 @@ def show_answer(axis: Axes, match: Match, index: int, *, modes: bool = True) -> 
     """Target with heatmap, and the modes with their 1-std ellipses where asked for."""
     axis.imshow(blend_heatmap(match.image1, match.heatmap[index]))
     axis.autoscale(False)  # a wide ellipse must not shrink the image
-    if not modes:
-        return
+    if modes:
+        draw_modes(axis, match, index)
+
+
+def draw_modes(axis: Axes, match: Match, index: int) -> None:
+    """Rings at the modes of one query, their area the weight, and the 1-std ellipses."""
     for (x, y), weight, covariance in zip(match.modes[index], match.weights[index], match.covariances[index],
                                           strict=True):  # fmt: skip
         if not np.isfinite(x):

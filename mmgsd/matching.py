@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from dataclasses import dataclass
 from functools import cached_property
@@ -105,6 +106,11 @@ class Match:
         xy = np.where((confidence >= min_confidence)[:, None], self.modes[rows, chosen], np.nan)
         return Best(xy, self.spread_px[rows, chosen], confidence)
 
+    def __getitem__(self, index: int) -> Match:
+        """The answer to one query alone."""
+        names = ("xy", "modes", "weights", "covariances", "entropy", "outside", "cells")
+        return dataclasses.replace(self, **{name: getattr(self, name)[index][None] for name in names})
+
     def plot(self, index: int = 0):  # noqa: ANN201 (matplotlib is imported only where a plot is asked for)
         """Figure of source pixel, heatmap and modes with their 1-std ellipses, for one query."""
         from mmgsd.plots import plot_match
@@ -180,12 +186,31 @@ class Matcher:
         as the symmetry group has members; "auto" finds their number. ValueError for other images, or for ``xy``
         outside image0.
         """
-        image0, image1, points = check_question(image0, image1, xy)
-        size0, size1 = ((im.shape[1], im.shape[0]) for im in (image0, image1))
-        descriptors = self.describe([image0, image1])
-        cells = self.compute_heatmaps(descriptors[0], descriptors[1], torch.from_numpy(points), size0)
+        return self.prepare(image0, image1).match(xy, n=n)
+
+    def prepare(self, image0: np.ndarray, image1: np.ndarray) -> Pair:
+        """Describe two images once, to ask about them many times; ValueError for other images than `match` takes."""
+        image0, image1 = to_rgb(image0, "image0"), to_rgb(image1, "image1")
+        return Pair(self, image0, image1, self.describe([image0, image1]))
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two images with their descriptors: each question takes a few milliseconds."""
+
+    matcher: Matcher
+    image0: np.ndarray  # (H0, W0, 3) uint8
+    image1: np.ndarray  # (H1, W1, 3) uint8
+    descriptors: Tensor  # (2, D, h, w)
+
+    @torch.inference_mode()
+    def match(self, xy: np.ndarray | list, *, n: int | str | None = None) -> Match:
+        """As `Matcher.match`."""
+        size0, size1 = ((im.shape[1], im.shape[0]) for im in (self.image0, self.image1))
+        points = check_pixels(xy, size0)
+        cells = self.matcher.compute_heatmaps(*self.descriptors, torch.from_numpy(points), size0)
         centres = compute_cell_centres(size1, cells.shape[-2:])
-        return make_match(image0, image1, points, cells, centres, self.modes if n is None else n)
+        return make_match(self.image0, self.image1, points, cells, centres, self.matcher.modes if n is None else n)
 
 
 def load(weights: Path | str, *, device: str = "") -> Matcher:
@@ -221,7 +246,7 @@ def check_question(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Both images as (H, W, 3) uint8 and the pixels as (S, 2) float32; ValueError names the argument that is wrong."""
     image0, image1 = to_rgb(image0, "image0"), to_rgb(image1, "image1")
-    return image0, image1, _check_xy(xy, (image0.shape[1], image0.shape[0]))
+    return image0, image1, check_pixels(xy, (image0.shape[1], image0.shape[0]))
 
 
 def to_rgb(image: np.ndarray, name: str = "image") -> np.ndarray:
@@ -240,7 +265,8 @@ def to_rgb(image: np.ndarray, name: str = "image") -> np.ndarray:
     return np.ascontiguousarray(image[..., :3])
 
 
-def _check_xy(xy: np.ndarray | list, size: tuple[int, int]) -> np.ndarray:
+def check_pixels(xy: np.ndarray | list, size: tuple[int, int]) -> np.ndarray:
+    """Pixels (S, 2) float32 inside image0 of ``size`` (width, height); ValueError otherwise."""
     points = np.asarray(xy, dtype=np.float32).reshape(-1, 2) if np.size(xy) == 0 else np.asarray(xy, dtype=np.float32)
     if points.ndim != 2 or points.shape[1] != 2:
         raise ValueError(f"xy must be (S, 2) px, got shape {points.shape}")
