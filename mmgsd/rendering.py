@@ -29,6 +29,7 @@ from mmgsd.dataset import FORMAT, SPLITS, load_dataset
 from mmgsd.symmetry import GRID_GROUPS, LINE_GROUPS, load_group, load_mirror
 
 IMAGES_A_BATCH = 30  # a child process ends after about so many, which bounds its memory
+SCENES = {"cloth": 2, "rope": 1}  # to be raised where the same configuration gives another object than before
 GROUPS = {"cloth": GRID_GROUPS, "rope": LINE_GROUPS}
 
 
@@ -46,7 +47,8 @@ def render_dataset(
     address. Finished batches of a killed call are kept. ValueError where the folder holds another configuration.
     """
     if (folder / "dataset.json").is_file() and not overwrite:
-        _check_same_config(config, load_dataset(folder).info["config"], folder)
+        info = load_dataset(folder).info
+        _check_same_config(config, info["config"] | {"scenes": info["versions"].get("scenes", 1)}, folder)
         return folder
     partial = folder.with_name(folder.name + ".partial")
     if overwrite:
@@ -130,10 +132,15 @@ def _render_batches(client: Client, jobs: dict, partial: Path, config: RenderCon
 
 
 def _check_same_config(config: RenderConfig, stored: dict, folder: Path) -> None:
-    asked = dataclasses.asdict(config)
+    asked = _describe(config)
     if stored != asked:
         changed = [f"{k}: {stored.get(k)!r} there, {v!r} asked for" for k, v in asked.items() if stored.get(k) != v]
         raise ValueError(f"{folder} holds another data set ({'; '.join(changed)}): use overwrite=True to replace it")
+
+
+def _describe(config: RenderConfig) -> dict:
+    """All that decides the images."""
+    return dataclasses.asdict(config) | {"scenes": SCENES[config.object]}
 
 
 def _claim(config: RenderConfig, partial: Path) -> None:
@@ -141,7 +148,7 @@ def _claim(config: RenderConfig, partial: Path) -> None:
     if path.is_file():
         _check_same_config(config, json.loads(path.read_text()), partial)
     aside = path.with_suffix(".tmp")
-    aside.write_text(json.dumps(dataclasses.asdict(config)))
+    aside.write_text(json.dumps(_describe(config)))
     os.replace(aside, path)
 
 
@@ -162,12 +169,16 @@ def _assemble(config: RenderConfig, partial: Path) -> Path:
         "default_group": DEFAULT_GROUP[config.object],
         "images": labels.split.value_counts().to_dict(),
         "config": dataclasses.asdict(config),
-        "versions": {name: importlib.metadata.version(name) for name in ("bpy", "numpy", "pillow")},
+        "versions": {"scenes": SCENES[config.object], **_list_versions()},
         "symmetry": groups,
         "mirror": load_mirror(config.object).tolist(),
     }
     (folder / "dataset.json").write_text(json.dumps(info))
     return folder
+
+
+def _list_versions() -> dict[str, str]:
+    return {name: importlib.metadata.version(name) for name in ("bpy", "numpy", "pillow")}
 
 
 def _unpack(path: Path, folder: Path) -> Iterator[dict]:

@@ -1,11 +1,13 @@
 """The rendering stage: planned by configuration alone, resumed after a kill, never mixed with another configuration."""
 
 import dataclasses
+import json
 import os
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import psutil
@@ -18,16 +20,16 @@ from mmgsd.dataset import check_dataset
 from mmgsd.rendering import RenderError, plan_batches, render_batch, render_dataset
 
 CONFIG = RenderConfig(object="rope", train_images=3, test_images=2, views=1, samples=1, seed=5)
+# without a main guard: a plain script may render
 SCRIPT = """
 import sys
 from pathlib import Path
 from mmgsd import rendering
 from mmgsd.config import RenderConfig
-if __name__ == "__main__":
-    rendering.IMAGES_A_BATCH = 1
-    config = RenderConfig(object="rope", train_images=3, test_images=2, views=1, samples=1, seed=5)
-    how = {"workers": int(sys.argv[2]), "scheduler": sys.argv[3]}
-    rendering.render_dataset(config, Path(sys.argv[1]), progress=False, **how)
+rendering.IMAGES_A_BATCH = 1
+config = RenderConfig(object="rope", train_images=3, test_images=2, views=1, samples=1, seed=5)
+how = {"workers": int(sys.argv[2]), "scheduler": sys.argv[3]}
+rendering.render_dataset(config, Path(sys.argv[1]), progress=False, **how)
 """
 
 
@@ -114,3 +116,14 @@ def test_a_failing_child_says_why() -> None:
     job = next(iter(plan_batches(CONFIG).values()))
     with pytest.raises(RenderError, match="split must be one of"):
         render_batch({**job, "split": "validation"})
+
+
+def test_images_of_an_older_kind_of_cloth_are_not_taken_for_todays(tiny_dataset: Callable[..., Path]) -> None:
+    config, folder = RenderConfig(object="cloth"), tiny_dataset(object="cloth")
+    info = json.loads((folder / "dataset.json").read_text()) | {"config": dataclasses.asdict(config)}
+    (folder / "dataset.json").write_text(json.dumps(info))
+    with pytest.raises(ValueError, match=r"scenes: 1 there, \d+ asked for.*overwrite=True"):
+        render_dataset(config, folder)
+    info["versions"]["scenes"] = rendering.SCENES["cloth"]
+    (folder / "dataset.json").write_text(json.dumps(info))
+    assert render_dataset(config, folder) == folder
