@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from matplotlib import pyplot as plt
 from matplotlib.backend_bases import MouseEvent
 
 from mmgsd.baselines import BaselineMatcher
@@ -17,6 +19,13 @@ from mmgsd.matching import Matcher
 from mmgsd.network import build_network
 
 CONFIG = TrainConfig(input_px=64, descriptor_dim=4)
+
+
+@pytest.fixture(autouse=True)
+def close_figures() -> Iterator[None]:
+    """An explorer's figure stays open as long as its notebook."""
+    yield
+    plt.close("all")
 
 
 @pytest.fixture
