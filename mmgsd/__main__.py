@@ -12,7 +12,7 @@ from PIL import Image, UnidentifiedImageError
 
 import mmgsd
 
-EXAMPLE = "example: python -m mmgsd match towel1.jpg towel2.jpg --xy 212,148 --weights cloth --out match.png"
+EXAMPLE = "example: python -m mmgsd match towel1.jpg towel2.jpg --xy 212,148 --weights FILE --out match.png"
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -21,7 +21,7 @@ def main(arguments: list[str] | None = None) -> None:
     asked = parser.parse_args(arguments)
     try:
         {"match": _match, "export": _export}[asked.command](asked)
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, RuntimeError) as error:
         parser.exit(1, f"error: {error}\n")
 
 
@@ -40,8 +40,8 @@ def make_parser() -> argparse.ArgumentParser:
     export = commands.add_parser("export", help="write a network as ONNX: image in, descriptors out")
     export.add_argument("out", type=Path, help="the file to write, .onnx")
     for command in (match, export):
-        command.add_argument("--weights", default="cloth", metavar="NAME",
-                             help="cloth, rope, or a safetensors file of your own (default: %(default)s)")  # fmt: skip
+        command.add_argument("--weights", required=True, metavar="FILE",
+                             help="a trained model (safetensors); or cloth, rope: those in data/weights")  # fmt: skip
     return parser
 
 

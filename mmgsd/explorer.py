@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import ipywidgets
 import numpy as np
@@ -19,12 +19,6 @@ from mmgsd.matching import Match, to_rgb
 
 TRUE = "#00FF6A"  # the sign of true matches
 SNAP_PX = 12.0  # a click so near to a material point shows that point's true matches
-
-
-class Answering(Protocol):
-    """What a method brings for one pair of images."""
-
-    def __call__(self, xy: np.ndarray) -> Match: ...
 
 
 @dataclass(frozen=True)
@@ -114,7 +108,7 @@ class Explorer:
         self.line.value = self._describe()
         return self.answer
 
-    def _get_answering(self) -> Answering:
+    def _get_answering(self) -> Callable[[np.ndarray], Match]:
         """The chosen method, its descriptors of this pair computed once."""
         name = self.method.value
         if name not in self._prepared:

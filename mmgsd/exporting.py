@@ -49,6 +49,7 @@ def export_onnx(matcher: Matcher, path: Path) -> float:
     got = onnxruntime.InferenceSession(aside, providers=["CPUExecutionProvider"]).run(None, {"image": image.numpy()})
     difference = float(np.abs(got[0] - expected).max() / np.abs(expected).max())
     if not difference <= TOLERANCE:
+        aside.unlink()
         raise RuntimeError(f"onnxruntime's descriptors differ from torch's by {difference:.1e}: {path} is not written")
     os.replace(aside, path)
     return difference

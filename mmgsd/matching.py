@@ -214,7 +214,7 @@ class Pair:
 
 
 def load(weights: Path | str, *, device: str = "") -> Matcher:
-    """A `Matcher` with weights that come with the repository (``"cloth"``, ``"rope"``), or with those of a file.
+    """A `Matcher` with the weights of a file, or those that ``data/weights`` holds for ``"cloth"`` or ``"rope"``.
 
     FileNotFoundError where there are none; ValueError for a file that is damaged or not ours.
     """

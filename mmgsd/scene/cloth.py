@@ -12,7 +12,7 @@ from mathutils.bvhtree import BVHTree
 from mmgsd.config import RenderConfig
 from mmgsd.scene.render import DeformedObject, add_mesh, read_vertices
 
-SIDE = 37  # simulated vertices a side: 49 take twice the time, a third of all, for wrinkles no one misses
+SIDE = 37  # simulated vertices a side; with 49 a frame takes nearly twice as long
 RENDERED_SIDE = 2 * SIDE - 1  # once subdivided: every third vertex is a material point
 EXTENT = 1.0  # m
 SPACING = EXTENT / (SIDE - 1)

@@ -74,7 +74,7 @@ def main() -> None:
     config = load_preset(asked.preset).method(asked.object, asked.method)
     config, dataset = dataclasses.replace(config, **parse_changes(asked.changes)), paths.dataset(asked.object)
     held_out = hold_out(load_dataset(dataset, "train"))[1]
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True).stdout.strip()
+    commit = subprocess.run(["git", "describe", "--always", "--dirty"], capture_output=True, text=True).stdout.strip()
     pace, results = measure_pace(config, dataset), []
     for minutes in asked.minutes:
         # two digits: an interrupted run is found again although the pace is never the same
@@ -87,7 +87,8 @@ def main() -> None:
         row = {
             "date": datetime.date.today().isoformat(), "commit": commit, "preset": asked.preset, "object": asked.object,
             "method": asked.method, "setting": " ".join(asked.changes), "steps": steps, "minutes": f"{taken:.1f}",
-            "images_seen": steps * run.batch, "rmse_px": f"{rmse:.1f}", "hardware": note["hardware"],
+            "images_seen": steps * run.batch, "data": note["data"], "rmse_px": f"{rmse:.1f}",
+            "hardware": note["hardware"],
         }  # fmt: skip
         record(row, paths.root / "data" / "results" / "experiments.csv")
         results.append(f"{rmse:.1f} px in {taken:.1f} min")
