@@ -1,8 +1,8 @@
-"""How fast data sets are rendered, and where the time goes: ``python tests/bench/bench_rendering.py [images]``.
+"""How fast data sets are rendered, and where the time goes: ``python tests/bench/bench_rendering.py [images] [views]``.
 
 First four episodes of each object in one process, with a clock on each step. Then ``images`` (default 300) of each
-object at the paper's size, ten an episode, with as many workers as there are cores, exactly as `render_dataset` does
-it: processes started, physics, labels and writing included.
+object at the paper's size, ``views`` (default 10) an episode, with as many workers as there are cores, exactly as
+`render_dataset` does it: processes started, physics, labels and writing included.
 """
 
 import subprocess
@@ -55,9 +55,10 @@ print(f"  {'all':36s}{(time.perf_counter() - begin) / len(views):8.4f} s an imag
 """
 
 
-def measure_throughput(kind: str, images: int) -> float:
+def measure_throughput(kind: str, images: int, views: int) -> float:
     """Images a second of the whole stage."""
-    config = RenderConfig(object=kind, train_images=images - images // 8, test_images=images // 8, seed=SEED)
+    sizes = {"train_images": images - images // 8, "test_images": images // 8, "views": views}
+    config = RenderConfig(object=kind, seed=SEED, **sizes)
     with tempfile.TemporaryDirectory() as folder:
         start = time.perf_counter()
         render_dataset(config, Path(folder) / kind, progress=False)
@@ -66,11 +67,11 @@ def measure_throughput(kind: str, images: int) -> float:
 
 def main() -> None:
     """Print the split, then the line that is compared."""
-    images = int(sys.argv[1]) if len(sys.argv) > 1 else 300
+    images, views = (int(given) for given in (*sys.argv[1:3], *(300, 10)[len(sys.argv) - 1 :]))
     for kind in OBJECTS:
         print(f"{kind}, 40 images:", flush=True)
         subprocess.run([sys.executable, "-c", SPLIT, kind, str(SEED)], check=True)
-    rates = [f"{kind} {measure_throughput(kind, images):.2f} images/s" for kind in OBJECTS]
+    rates = [f"{kind} {measure_throughput(kind, images, views):.2f} images/s" for kind in OBJECTS]
     print(", ".join(rates))
 
 
