@@ -102,6 +102,7 @@ class TrainConfig:
     margin: float = 0.5  # contrastive losses only
     non_matches: int = 150  # a match, half of them on the object (contrastive losses only)
     augment: bool = True
+    bend: float = 0.5  # augmentation stretches and squeezes images along random waves, by up to this share
     rotate: bool = True  # augmentation turns images by any angle; off where the rotation limit is the experiment
     seed: int = 0
 
@@ -121,6 +122,7 @@ class TrainConfig:
             _check(name, getattr(self, name), "greater than 0", getattr(self, name) > 0)
         _check("batch", self.batch, "at least 2 (a pair)", self.batch >= 2)
         _check("input_px", self.input_px, "at least 64", self.input_px >= 64)
+        _check("bend", self.bend, "in [0, 0.5]", 0 <= self.bend <= 0.5)
         for name in ("weight_decay", "seed"):
             _check(name, getattr(self, name), "at least 0", getattr(self, name) >= 0)
 
