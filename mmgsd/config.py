@@ -98,7 +98,7 @@ class TrainConfig:
     weight_decay: float = 0.02
     sigma_px: float = 1.0  # std of a target mode at the end of training
     sigma_start_px: float = 48.0  # std at its start; annealed geometrically over the first two thirds
-    prototype_weight: float = 1.0  # of the dense supervision by single images (unimodal and mmgsd); 0: pairs only
+    prototype_weight: float = -1.0  # of the dense supervision by single images; -1: 0 for pcl and spcl, 1 for others
     margin: float = 0.5  # contrastive losses only
     non_matches: int = 150  # a match, half of them on the object (contrastive losses only)
     augment: bool = True
@@ -115,6 +115,8 @@ class TrainConfig:
         accepted = "'' for lite0, which brings its own"
         _check("trunk_weights", self.trunk_weights, accepted, not self.trunk_weights or self.network == "resnet34")
         _set_frozen(self, "group", self.group or DEFAULT_GROUP[self.object])
+        weight = self.prototype_weight
+        _check("prototype_weight", weight, "at least 0, or -1 for the method's own", weight >= 0 or weight == -1)
         for name in ("descriptor_dim", "steps", "pairs", "queries"):
             _check(name, getattr(self, name), "at least 1", getattr(self, name) >= 1)
         _check("non_matches", self.non_matches, "at least 2 (on and off the object)", self.non_matches >= 2)
@@ -125,6 +127,11 @@ class TrainConfig:
         _check("bend", self.bend, "in [0, 0.5]", 0 <= self.bend <= 0.5)
         for name in ("weight_decay", "seed"):
             _check(name, getattr(self, name), "at least 0", getattr(self, name) >= 0)
+
+    @property
+    def dense_weight(self) -> float:
+        """Weight of the dense supervision that the method gets."""
+        return float(self.method in ("unimodal", "mmgsd")) if self.prototype_weight < 0 else self.prototype_weight
 
     @property
     def name(self) -> str:

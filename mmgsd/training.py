@@ -152,8 +152,8 @@ class _Run:
         self.network.train()
         descriptors = self.network(batch.image.contiguous(memory_format=torch.channels_last))
         loss = compute_loss(self.config, descriptors, batch, self.permutations, self.size, self.step)
-        if self.config.prototype_weight and self.config.method not in CONTRASTIVE:
-            loss = loss + self.config.prototype_weight * self.compute_dense_loss(descriptors, batch)
+        if self.config.dense_weight:
+            loss = loss + self.config.dense_weight * self.compute_dense_loss(descriptors, batch)
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.trained, 5.0)
