@@ -26,6 +26,7 @@ from mmgsd.network import compute_cell_centres
 BASELINES = list_baselines()  # hand-made descriptors that this OpenCV has
 CHANCE = ("centre", "random")
 BANDWIDTHS = (1 / 64, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2)  # of a contrastive heatmap, in margins
+MEASURES = "2"  # to be raised where the same answers are measured in another way
 TEMPERATURES = (0.1, 10.0)  # range in which the calibrated one is sought
 
 Answer = Callable[[int, int, np.ndarray, np.ndarray], tuple[Mixture, Tensor]]
@@ -73,8 +74,8 @@ def evaluate_baseline(
 def load_queries(path: Path) -> pd.DataFrame:
     """One method's table, a row a query.
 
-    pair, image0, image1, point; visible (source), n and hidden (true matches), rmse_px, nearest_px, best_px, pck@…,
-    entropy (nats), outside (share of the heatmap), mahalanobis2 (a list of n).
+    pair, image0, image1, point; visible (source), n and hidden (true matches), rmse_px, nearest_px, best_px, swapped,
+    pck@…, entropy (nats), outside (share of the heatmap), mahalanobis2 (a list of n).
     """
     return pd.read_parquet(path)
 
@@ -245,7 +246,8 @@ def _describe_batches(matcher: Matcher, data: Dataset, indices: np.ndarray, batc
 
 def _describe_question(data: Dataset, config: EvaluateConfig, group: str, method: str) -> dict[str, str]:
     """What a table of answers depends on; kept in it, so that a stale one is noticed."""
-    return {"data": data.fingerprint, "config": digest(config), "group": data.group(group).name, "method": method}
+    asked = {"data": data.fingerprint, "config": digest(config), "group": data.group(group).name}
+    return {**asked, "method": method, "measures": MEASURES}
 
 
 def _is_answered(out: Path, question: dict[str, str]) -> bool:

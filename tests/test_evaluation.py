@@ -100,7 +100,7 @@ def test_one_row_a_query(cloth_dataset: Path, tmp_path: Path) -> None:
     queries = ask_baseline("centre", cloth_dataset, tmp_path / "centre.parquet")
     assert list(queries.columns) == [
         "pair", "image0", "image1", "point", "visible", "n", "entropy", "hidden", "outside", "mahalanobis2",
-        "rmse_px", "nearest_px", "best_px", "pck@5px", "pck@10px", "pck@20px",
+        "rmse_px", "nearest_px", "best_px", "swapped", "pck@5px", "pck@10px", "pck@20px",
     ]  # fmt: skip
     assert len(queries) == CONFIG.pairs * CONFIG.points
     assert not queries.duplicated(["pair", "point"]).any()
@@ -204,7 +204,7 @@ def test_as_many_points_as_asked_for(count: int) -> None:
 def test_summary_separates_visible_sources(tmp_path: Path) -> None:
     shares = dict.fromkeys(["pck@5px", "pck@10px", "pck@20px"], 1.0)
     table = pd.DataFrame(
-        {"visible": [True, True, False], "rmse_px": [1.0, 3.0, 8.0], "nearest_px": 1.0, "best_px": 1.0, **shares}
+        {"visible": [True, True, False], "rmse_px": [1.0, 3.0, 8.0], "nearest_px": 1.0, "best_px": 1.0, "swapped": 0.0, **shares}
     )
     table.to_parquet(tmp_path / "mmgsd.parquet")
     summary = summarise({"mmgsd": tmp_path / "mmgsd.parquet"})["mmgsd"]
