@@ -11,7 +11,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from mmgsd.metrics import aggregate, compute_mahalanobis2, compute_mode_errors, compute_query_errors
+from mmgsd.metrics import (
+    aggregate,
+    compute_mahalanobis2,
+    compute_mode_errors,
+    compute_query_errors,
+    compute_swaps,
+)
 
 TRUE = np.array([[[0.0, 0.0], [100.0, 0.0]]])
 MODES = np.array([[[100.0, 8.0], [3.0, 4.0]]])  # 8 px from the second, 5 px from the first
