@@ -91,7 +91,8 @@ class TrainConfig:
     input_px: int = 128  # the longer side of the network's input
     steps: int = 600
     batch: int = 16  # images a step
-    pairs: int = 60  # ordered pairs of a batch's images
+    groups: int = 1  # parts of a batch normalised and paired each by itself; as many processes can share a step
+    pairs: int = 60  # ordered pairs of images a step
     queries: int = 64  # source points a pair
     learning_rate: float = 1.5e-3
     schedule: str = "cosine"  # or "step": times 0.9 every 250 steps, the reference of the contrastive losses
@@ -123,6 +124,9 @@ class TrainConfig:
         for name in ("learning_rate", "sigma_px", "sigma_start_px", "margin"):
             _check(name, getattr(self, name), "greater than 0", getattr(self, name) > 0)
         _check("batch", self.batch, "at least 2 (a pair)", self.batch >= 2)
+        each = f"a divisor of batch and pairs that leaves at least 2 of {self.batch} images and a pair in each"
+        divides = self.groups >= 1 and self.batch % self.groups == 0 == self.pairs % self.groups
+        _check("groups", self.groups, each, divides and self.batch // self.groups >= 2)
         _check("input_px", self.input_px, "at least 64", self.input_px >= 64)
         _check("bend", self.bend, "in [0, 0.5]", 0 <= self.bend <= 0.5)
         for name in ("weight_decay", "seed"):
