@@ -176,13 +176,13 @@ class Preset:
 
 
 def _preset(
-    name: str, *, train: dict, rope: dict, ablation: dict, evaluate: dict, sigmas: tuple, **render: int
+    name: str, *, views: dict, train: dict, rope: dict, ablation: dict, evaluate: dict, sigmas: tuple, **images: int
 ) -> Preset:
     cloth_train = TrainConfig(object="cloth", **train)
     rope_train = TrainConfig(object="rope", **{**train, **rope})
     return Preset(
         name=name,
-        render={o: RenderConfig(object=o, **render) for o in OBJECTS},
+        render={o: RenderConfig(object=o, views=views[o], **images) for o in OBJECTS},
         train={"cloth": cloth_train, "rope": rope_train},
         evaluate=EvaluateConfig(**evaluate),
         ablation={t.object: dataclasses.replace(t, **ablation) for t in (cloth_train, rope_train)},
@@ -199,21 +199,21 @@ def load_preset(name: str) -> Preset:
 PRESETS = {
     "smoke": _preset(
         "smoke",
-        train_images=16, test_images=8, views=4,
+        train_images=16, test_images=8, views={"cloth": 4, "rope": 4},
         train={"steps": 6, "batch": 4, "pairs": 6, "queries": 16, "input_px": 64}, rope={},
         ablation={"steps": 4}, sigmas=(1.0, 16.0),
         evaluate={"pairs": 4, "points": 25},
     ),
     "quick": _preset(
         "quick",
-        train_images=300, test_images=50, views=5,
+        train_images=300, test_images=50, views={"cloth": 5, "rope": 5},
         train={"steps": 225, "input_px": 96, "pairs": 40, "queries": 32}, rope={"input_px": 128},
         ablation={"steps": 60}, sigmas=(1.0, 4.0, 16.0),
         evaluate={"pairs": 30, "points": 625},
     ),
     "paper": _preset(
         "paper",
-        train_images=3500, test_images=500, views=10,
+        train_images=3500, test_images=500, views={"cloth": 5, "rope": 10},
         train={"steps": 12000}, rope={"input_px": 160},
         ablation={"steps": 2000}, sigmas=(1.0, 2.0, 4.0, 8.0, 16.0),
         evaluate={"pairs": 500, "points": 625},

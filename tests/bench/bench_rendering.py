@@ -1,8 +1,8 @@
 """How fast data sets are rendered, and where the time goes: ``python tests/bench/bench_rendering.py [images]``.
 
 First four episodes of each object in one process, with a clock on each step. Then ``images`` (default 300) of each
-object at the paper's size with as many workers as there are cores, exactly as `render_dataset` does it: processes
-started, physics, labels and writing included.
+object at the paper's size, ten an episode, with as many workers as there are cores, exactly as `render_dataset` does
+it: processes started, physics, labels and writing included.
 """
 
 import subprocess
