@@ -12,6 +12,7 @@ import hashlib
 import json
 import math
 import os
+import re
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -19,7 +20,8 @@ OBJECTS = ("cloth", "rope")
 METHODS = ("pcl", "spcl", "unimodal", "mmgsd")
 IMAGE_SIZE = {"cloth": (485, 485), "rope": (640, 480)}  # (width, height) px, paper section "Quantitative Results"
 DEFAULT_GROUP = {"cloth": "c4", "rope": "c2"}
-N_POINTS = 625  # material points of each object
+OWN_GROUP = "own"  # of any other object: what its file says
+N_POINTS = 625  # material points of the cloth and the rope
 
 Config = TypeVar("Config", bound="RenderConfig | TrainConfig | EvaluateConfig")
 
@@ -27,6 +29,13 @@ Config = TypeVar("Config", bound="RenderConfig | TrainConfig | EvaluateConfig")
 def _check(name: str, value: Any, accepted: str, ok: bool) -> None:
     if not ok:
         raise ValueError(f"{name} must be {accepted}, got {value!r}")
+
+
+def _check_object(name: str) -> None:
+    """The cloth, the rope, or a name that an object of the user's own may have."""
+    close = difflib.get_close_matches(str(name), OBJECTS, n=1)
+    if name not in OBJECTS and (close or not re.fullmatch("[a-z][a-z0-9_-]*", str(name))):
+        _check_choice("object", name, (*OBJECTS, "the name of a file in data/objects"))
 
 
 def _check_choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
@@ -54,7 +63,7 @@ def _check_types(config: Any) -> None:
 class RenderConfig:
     """What a rendered data set holds."""
 
-    object: str = "cloth"
+    object: str = "cloth"  # or "rope", or the name of a file in data/objects (see `mmgsd.sheet`)
     train_images: int = 60
     test_images: int = 20
     views: int = 10  # images of one simulation, each with its own camera, light and material
@@ -65,7 +74,7 @@ class RenderConfig:
 
     def __post_init__(self) -> None:
         _check_types(self)
-        _check_choice("object", self.object, OBJECTS)
+        _check_object(self.object)
         for name in ("train_images", "test_images", "views", "samples"):
             _check(name, getattr(self, name), "at least 1", getattr(self, name) >= 1)
         _check("rotation_deg", self.rotation_deg, "in (0, 180]", 0 < self.rotation_deg <= 180)
@@ -74,7 +83,7 @@ class RenderConfig:
 
     @property
     def size(self) -> tuple[int, int]:
-        """(width, height) of an image in px."""
+        """(width, height) of an image of the cloth or the rope in px."""
         return IMAGE_SIZE[self.object]
 
 
@@ -84,7 +93,7 @@ class TrainConfig:
 
     object: str = "cloth"
     method: str = "mmgsd"
-    group: str = ""  # symmetry group the matches come from; "" is the object's own (c4 or c2)
+    group: str = ""  # symmetry group the matches come from; "" is the object's own (c4, c2, or its file's)
     network: str = "lite0"  # or "resnet34", the contrastive papers' reference
     trunk_weights: str = ""  # safetensors file of ImageNet weights for resnet34, torchvision's names; "": random
     descriptor_dim: int = 32
@@ -109,13 +118,13 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         _check_types(self)
-        _check_choice("object", self.object, OBJECTS)
+        _check_object(self.object)
         _check_choice("method", self.method, METHODS)
         _check_choice("network", self.network, ("lite0", "resnet34"))
         _check_choice("schedule", self.schedule, ("cosine", "step"))
         accepted = "'' for lite0, which brings its own"
         _check("trunk_weights", self.trunk_weights, accepted, not self.trunk_weights or self.network == "resnet34")
-        _set_frozen(self, "group", self.group or DEFAULT_GROUP[self.object])
+        _set_frozen(self, "group", self.group or DEFAULT_GROUP.get(self.object, OWN_GROUP))
         weight = self.prototype_weight
         _check("prototype_weight", weight, "at least 0, or -1 for the method's own", weight >= 0 or weight == -1)
         for name in ("descriptor_dim", "steps", "pairs", "queries"):

@@ -16,7 +16,7 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from mmgsd.baselines import BaselineMatcher, list_baselines
-from mmgsd.config import N_POINTS, EvaluateConfig, digest
+from mmgsd.config import EvaluateConfig, digest
 from mmgsd.dataset import Dataset, load_dataset, sample_pairs
 from mmgsd.matching import Matcher, read_heatmap
 from mmgsd.metrics import aggregate, compute_mahalanobis2, compute_query_errors
@@ -132,7 +132,7 @@ def calibrate_temperature(
     ``data`` must not have been trained on. Leaves it set on the matcher and returns it.
     """
     chosen = sample_pairs(data.episode, pairs, np.random.default_rng(seed))
-    descriptors, points = _describe(matcher, data, np.unique(chosen)), choose_points(points)
+    descriptors, points = _describe(matcher, data, np.unique(chosen)), choose_points(points, data.n_points)
     orbits = data.group(matcher.config.group).permutations[:, points].T  # (S, G)
     matcher.temperature, logits, true = 1.0, [], []
     for first, second in chosen:
@@ -159,15 +159,15 @@ def _find_cells(xy: np.ndarray, size: tuple[int, int], shape: tuple[int, int]) -
     return row * shape[1] + column
 
 
-def choose_points(count: int) -> np.ndarray:
-    """``count`` material points of 625 spread evenly in order; all of them at 625."""
-    return np.unique(np.linspace(0, N_POINTS - 1, count).round().astype(int))
+def choose_points(count: int, total: int) -> np.ndarray:
+    """``count`` of ``total`` material points spread evenly in order; all of them where there are no more."""
+    return np.unique(np.linspace(0, total - 1, min(count, total)).round().astype(int))
 
 
 def _ask(answer: Answer, data: Dataset, config: EvaluateConfig, group: str, progress: bool, name: str) -> pd.DataFrame:
     """Ask ``answer`` every query and compare with the truth; one row a query."""
     pairs = _draw_pairs(data, config)
-    symmetry, points = data.group(group), choose_points(config.points)
+    symmetry, points = data.group(group), choose_points(config.points, data.n_points)
     orbits = [symmetry.distinct_modes(int(p)) for p in points]
     count = np.array([len(o) for o in orbits])
     frames = []
