@@ -35,7 +35,7 @@ class DatasetError(ValueError):
 class Dataset:
     """One split of a data set, labels in memory, images read when asked for.
 
-    ``xy`` (N, P, 2) px, ``visible`` (N, P) bool, ``episode`` (N,) simulation of each image; P is 625 for cloth and rope.
+    ``xy`` (N, P, 2) px, ``visible`` (N, P) bool, ``episode`` (N,) simulation of each image; P is 625 of cloth or rope.
     """
 
     folder: Path
@@ -96,7 +96,8 @@ class Dataset:
             return None
         points = np.asarray(self.info["mirror"])
         if not np.array_equal(np.sort(points), np.arange(self.n_points)):
-            raise DatasetError(f"{self.folder / 'dataset.json'}: mirror must hold each of 0 to {self.n_points - 1} once")
+            place, last = self.folder / "dataset.json", self.n_points - 1
+            raise DatasetError(f"{place}: mirror must hold each of 0 to {last} once")
         return points
 
     def load_image(self, index: int) -> np.ndarray:

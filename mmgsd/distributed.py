@@ -1,7 +1,7 @@
 """Several processes that train one model, started by ``torchrun``: each takes some groups of every step's batch.
 
-Pairs of images never reach across groups: the descriptors of another process's images, and gradients through them, would
-have to travel at each step, and a group of 16 images has 240 ordered pairs already. So the groups are part of the
+Pairs of images never reach across groups: the descriptors of another process's images, and gradients through them,
+would have to travel at each step, and a group of 16 images has 240 ordered pairs already. So the groups are part of the
 configuration, and the number of processes changes nothing but the time.
 """
 

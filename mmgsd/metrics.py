@@ -59,8 +59,8 @@ def compute_query_errors(modes: np.ndarray, covariances: np.ndarray, true: np.nd
 
     ``rmse_px`` is the root mean square over a query's modes (the paper's formula lacks the root of its name),
     ``nearest_px`` the distance of the most probable mode to the nearest true one, ``best_px`` that of the mode with the
-    least spread (the first where no spread is known), ``pck@5px`` … the share of true modes found that near, ``swapped``
-    that of modes nearer to a wrong point of the orbit than to their own.
+    least spread (the first where no spread is known), ``pck@5px`` … the share of true modes found that near,
+    ``swapped`` that of modes nearer to a wrong point of the orbit than to their own.
     """
     errors = compute_mode_errors(modes, true)
     nearest = np.linalg.norm(true - modes[:, :1], axis=-1).min(1)

@@ -26,7 +26,7 @@ Descriptors of the method `{method}` for a {object}, symmetry group `{group}`; `
 |---|---|
 | data | preset `{preset}`, {images} training images of {width} x {height} px, seed {data_seed}, fingerprint `{data}` |
 | training | {steps} steps of {batch} images at {input_px} px, seed {seed}, {minutes:.0f} minutes on {hardware} |
-| RMSE | {rmse_mean:.1f} px mean, {median:.1f} px median over {queries:,} queries with a visible source, preset `{preset}` |
+| RMSE | {rmse_mean:.1f} px mean, {median:.1f} px median, {queries:,} queries with a visible source |
 | file | {megabytes:.1f} MB, safetensors, weights in half precision |
 
 Known limits: rendered images only, one object wholly in view and seen from above; {object}s without a print. Matches

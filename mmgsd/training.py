@@ -64,8 +64,8 @@ def train_model(
 
     The log (CSV) has a row a step; with ``validate_every`` steps, also the RMSE (px) on held-out simulations.
 
-    Under ``torchrun`` the processes share every step's groups (``config.groups`` must be a multiple of their number), and
-    the first one writes the files. The losses and gradients are those of a single process.
+    Under ``torchrun`` the processes share every step's groups (``config.groups`` must be a multiple of their number),
+    and the first one writes the files. The losses and gradients are those of a single process.
 
     A finished model is returned as it is, a killed run goes on from its last checkpoint and ends with the same weights.
     Raises ValueError where the data set is of another object or does not store the symmetry group.

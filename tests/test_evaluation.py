@@ -203,9 +203,8 @@ def test_as_many_points_as_asked_for(count: int) -> None:
 
 def test_summary_separates_visible_sources(tmp_path: Path) -> None:
     shares = dict.fromkeys(["pck@5px", "pck@10px", "pck@20px"], 1.0)
-    table = pd.DataFrame(
-        {"visible": [True, True, False], "rmse_px": [1.0, 3.0, 8.0], "nearest_px": 1.0, "best_px": 1.0, "swapped": 0.0, **shares}
-    )
+    others = {"nearest_px": 1.0, "best_px": 1.0, "swapped": 0.0, **shares}
+    table = pd.DataFrame({"visible": [True, True, False], "rmse_px": [1.0, 3.0, 8.0], **others})
     table.to_parquet(tmp_path / "mmgsd.parquet")
     summary = summarise({"mmgsd": tmp_path / "mmgsd.parquet"})["mmgsd"]
     assert (summary["rmse_mean"], summary["queries"]) == (2.0, 2)

@@ -1,4 +1,4 @@
-"""A square cloth, or a sheet of another shape, dropped, pinned, dragged, picked up and folded over by Blender's cloth physics."""
+"""A square cloth, or a sheet of another shape, dropped, pinned, dragged and folded over by cloth physics."""
 
 from __future__ import annotations
 
@@ -97,8 +97,8 @@ def _is_plausible(sheet: Sheet, vertices: np.ndarray) -> bool:
     """Whether the cloth came to lie, hardly stretched and hardly cutting through itself."""
     sides = np.sort(np.stack([sheet.faces, np.roll(sheet.faces, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
     a, b = np.unique(sides, axis=0).T
-    stretch = np.linalg.norm(vertices[a] - vertices[b], axis=-1) / np.linalg.norm(sheet.rest[a] - sheet.rest[b], axis=-1)
-    stretched, high = np.quantile(stretch, 0.99) > MAX_STRETCH, np.ptp(vertices[:, 2]) >= MAX_HEIGHT
+    now, at_rest = (np.linalg.norm(points[a] - points[b], axis=-1) for points in (vertices, sheet.rest))
+    stretched, high = np.quantile(now / at_rest, 0.99) > MAX_STRETCH, np.ptp(vertices[:, 2]) >= MAX_HEIGHT
     return not stretched and not high and count_crossings(vertices, sheet.faces) <= MAX_CROSSINGS
 
 

@@ -33,8 +33,8 @@ def main() -> None:
                 errors.append(table.rmse_px[table.visible].to_numpy())
         rendered, packed = (float(e.mean()) for e in errors)
         apart = np.median(np.abs(errors[0] - errors[1]))
-        print(f"{name}: {archive.stat().st_size / 1e6:.1f} MB; RMSE {rendered:.2f} px as rendered, {packed:.2f} px packed; "
-              f"one query differs by {apart:.2f} px (median)", flush=True)  # fmt: skip
+        print(f"{name}: {archive.stat().st_size / 1e6:.1f} MB; RMSE {rendered:.2f} px as rendered, "
+              f"{packed:.2f} px packed; one query differs by {apart:.2f} px (median)", flush=True)  # fmt: skip
 
 
 if __name__ == "__main__":
