@@ -1,9 +1,9 @@
 """Child process that renders one job: ``python -m mmgsd.scene < job.json``.
 
 The job holds ``config`` (the fields of ``RenderConfig``), ``split``, ``episodes`` as [[episode, views], …], ``sheet``
-(None, or the object as `Sheet.to_dict` gives it) and ``out``, the archive to write. Blender lives here alone: its memory
-goes with the process, and its chatter stays out of the parent's output. The exit code is 1 after an exception, its
-traceback on stderr.
+(None, or the object as `Sheet.to_dict` gives it) and ``out``, the archive to write. Blender lives here alone: its
+memory goes with the process, and its chatter stays out of the parent's output. The exit code is 1 after an exception,
+its traceback on stderr.
 """
 
 from __future__ import annotations
