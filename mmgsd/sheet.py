@@ -155,7 +155,7 @@ def _close(generators: list[np.ndarray]) -> list[np.ndarray]:
     for element in group:  # grows while it is walked through
         for generator in generators:
             product = generator @ element
-            if not any(np.allclose(product, known, atol=0.02) for known in group):
+            if not any(np.allclose(product, known, atol=1e-3) for known in group):
                 group.append(product)
             if len(group) > MAX_ORDER:
                 raise ValueError(f"symmetry must generate at most {MAX_ORDER} elements: are its angles exact?")

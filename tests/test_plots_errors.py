@@ -32,7 +32,7 @@ def test_distances_on_a_cloth_by_hand(data: Dataset) -> None:
     data.visible[0, 12 * 25 + 14] = False  # two points right of the centre
     described = describe_queries(make_queries([0, 30, 312]), data)
     assert described.border.tolist() == [0, 1, 12]
-    assert described.covered.tolist() == [14, 13, 2]
+    assert described.covered.tolist() == [14, 11, 2]
     assert described.state0.tolist() == ["state 0"] * 3
     assert described.state1.tolist() == ["state 1"] * 3
 

@@ -41,7 +41,7 @@ def measure_area(sheet: Sheet) -> float:
     [
         (SQUARE, "turns", 4), (SQUARE, "turns and faces", 8), (TOWEL, "turns", 2), (TOWEL, "turns and faces", 4),
         (TOWEL, [{"turn_deg": 180}], 2), (TOWEL, [{"over_deg": 0}, {"over_deg": 90}], 4), (TOWEL, [], 1),
-        ([[0, 0], [90, 0], [45, 78]], "turns", 1), ([[0, 0], [2, 0], [1, 3**0.5]], "turns and faces", 6),
+        ([[0, 0], [90, 0], [45, 50]], "turns", 1), ([[0, 0], [2, 0], [1, 3**0.5]], "turns and faces", 6),
         (TOWEL, [np.diag([-1.0, -1, 1, 1]).ravel().tolist()], 2),
     ],
 )  # fmt: skip
