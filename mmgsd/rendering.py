@@ -113,7 +113,7 @@ def _connect(workers: int, scheduler: str) -> Iterator[Client]:
         return
     threads = workers or os.cpu_count()  # they only wait for the children
     with _unchanged_environment(), LocalCluster(
-        n_workers=1, threads_per_worker=threads, processes=False, dashboard_address=None, silence_logs="ERROR",
+        n_workers=1, threads_per_worker=threads, processes=False, dashboard_address="127.0.0.1:0", silence_logs="ERROR",
     ) as local, Client(local) as client:  # fmt: skip
         yield client
 
