@@ -1,4 +1,4 @@
-"""All models of a preset as independent tasks, the most important first: here one after the other, or on a Dask cluster.
+"""All models of a preset as independent tasks, the most important first: here in turn, or on a Dask cluster.
 
     python -m mmgsd.matrix paper                                    trains and asks each model; a killed call goes on
     python -m mmgsd.matrix paper --scheduler tcp://host:8786        each worker one model at a time, on its own GPU
