@@ -118,7 +118,8 @@ def _encode(splits: list[Dataset], quality: int) -> Iterator[tuple[str, bytes]]:
         for index, row in enumerate(data.labels.itertuples()):
             yield row.file, _encode_webp(data.load_image(index), quality)
             yield row.mask, encode_mask(data.load_mask(index))
-    yield "labels.parquet", _encode_labels(pd.concat([data.labels for data in splits], ignore_index=True))
+    labels = pd.concat([data.labels for data in splits], ignore_index=True)
+    yield "labels.parquet", _encode_labels(labels, splits[0].size)
     counts = {data.split: len(data) for data in splits}
     yield "dataset.json", json.dumps({**splits[0].info, "images": counts, "packed": {"quality": quality}}).encode()
 
@@ -129,8 +130,10 @@ def _encode_webp(image: np.ndarray, quality: int) -> bytes:
     return buffer.getvalue()
 
 
-def _encode_labels(labels: pd.DataFrame) -> bytes:
-    xy = np.round(np.stack(labels.xy.to_list()) / LABEL_STEP) * LABEL_STEP
+def _encode_labels(labels: pd.DataFrame, size: tuple[int, int]) -> bytes:
+    xy = np.round(np.stack(labels.xy.to_list()) / LABEL_STEP).reshape(len(labels), -1, 2) * LABEL_STEP
+    inside = xy.clip(LABEL_STEP - 0.5, np.array(size) - 0.5 - LABEL_STEP)  # rounding must not put what is seen outside
+    xy = np.where(np.stack(labels.visible.to_list())[..., None], inside, xy).reshape(len(labels), -1)
     table = pa.Table.from_pandas(labels.assign(xy=list(xy.astype(np.float32))), preserve_index=False)
     plain = [c for c in table.column_names if c not in ("xy", "intrinsics", "camera_pose")]
     buffer = io.BytesIO()

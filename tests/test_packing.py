@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import json
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from mmgsd import packing
@@ -89,3 +91,18 @@ def test_a_sample_shows_different_simulations(
 def test_the_committed_sample_is_whole_and_small(name: str) -> None:
     assert check_dataset(SAMPLE / name).images.to_list() == [16, 8]
     assert sum(path.stat().st_size for path in (SAMPLE / name).rglob("*")) < 1_500_000
+
+
+def test_rounding_puts_no_visible_point_outside(cloth_dataset: Path) -> None:
+    data = load_dataset(cloth_dataset)
+    labels = data.labels.iloc[:1].copy()
+    xy, (width, height) = data.xy[:1].copy(), data.size
+    xy[0, :3] = [(-0.499, 5), (width - 0.501, height - 0.501), (-0.6, 3)]
+    labels["xy"], visible = [xy.reshape(-1)], data.visible[0].copy()
+    visible[2] = False
+    labels["visible"] = [visible]
+    kept = np.stack(pd.read_parquet(io.BytesIO(packing._encode_labels(labels, data.size))).xy[0]).reshape(-1, 2)
+    assert (np.rint(kept[:2]) >= 0).all()
+    assert (np.rint(kept[:2]) < data.size).all()
+    assert np.abs(kept - xy[0]).max() <= LABEL_STEP
+    assert kept[2, 0] == pytest.approx(-0.625)  # what is outside stays there
