@@ -2,7 +2,7 @@
 
 For each budget one MMGSD model of the preset's data is trained from the start, in as many steps as fit (the pace is
 measured first), and validated on the training simulations that `hold_out` keeps apart: never on test images. Settings
-of `TrainConfig` can be changed, as in ``input_px=160 batch=24``. Every run is a row of
+of `TrainConfig` can be changed, before the options: ``input_px=160 batch=24 --minutes 12``. Every run is a row of
 ``data/results/experiments.csv``; one that was interrupted goes on. Run it alone: a second busy process slows torch
 down several times.
 """
