@@ -14,7 +14,7 @@ PYTHON ?= $(shell for p in python3.11 python3 python; do \
 TORCH_INDEX ?=
 # CUDA=1 installs torch with CUDA instead of the CPU build.
 CUDA ?=
-# make data-pack, data-unpack, data-sample: which data sets.
+# make data-pack, data-unpack, data-sample, weights: of which preset.
 PRESET ?= paper
 # make lock: the uv program, and a folder that holds torch's CPU wheel.
 UV ?= uv
@@ -31,7 +31,7 @@ PIP := env -u PYTHONDONTWRITEBYTECODE $(PY) -m pip --disable-pip-version-check i
 STAMP := .venv/.installed
 PAPERMILL := $(PY) -m papermill --kernel python3
 
-.PHONY: help .venv reproduce smoke test lint unit notebooks-test readme data-pack data-unpack data-sample lab lock \
+.PHONY: help .venv reproduce smoke test lint unit notebooks-test readme weights data-pack data-unpack data-sample lab lock \
 	clean clean-all force
 
 help: ## List the targets
@@ -56,7 +56,7 @@ unit: $(STAMP) ## Run the tests in tests/
 # run_all would run every notebook a second time: a test in tests/ runs it through papermill.
 notebooks-test: $(STAMP) ## Run the notebooks and compare their outputs with the committed ones
 	$(PY) -m pytest --nbval --nbval-current-env --nbval-cell-timeout=600 \
-		--nbval-sanitize-with=tests/nbval_sanitize.cfg notebooks/0*.ipynb
+		--nbval-sanitize-with=tests/nbval_sanitize.cfg notebooks/0*.ipynb notebooks/explore.ipynb notebooks/your_*.ipynb
 
 readme: $(STAMP) ## Put the numbers of data/results/quick into the README
 	$(PY) -m mmgsd.tables data/results/quick README.md
@@ -69,6 +69,9 @@ data-unpack: $(STAMP) ## Unpack them there; the SHA-256 must be that of the note
 
 data-sample: $(STAMP) ## Copy 24 images of each object of PRESET into data/sample
 	$(PY) -m mmgsd.packing sample $(PRESET)
+
+weights: $(STAMP) ## Put the models of PRESET into data/weights, in half precision and with a card each
+	$(PY) -m mmgsd.shipping $(PRESET)
 
 lab: $(STAMP) ## Open the notebooks in JupyterLab
 	$(PY) -m jupyterlab notebooks

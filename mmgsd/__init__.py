@@ -3,7 +3,7 @@
 from typing import Any
 
 __version__ = "0.1.0"
-__all__ = ["Matcher", "load"]
+__all__ = ["Matcher", "load", "read_image"]
 
 
 def __getattr__(name: str) -> Any:

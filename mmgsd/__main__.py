@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
 
 import mmgsd
 
@@ -46,7 +45,7 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def _match(asked: argparse.Namespace) -> None:
-    images = [_read_image(path) for path in (asked.image0, asked.image1)]
+    images = [mmgsd.read_image(path) for path in (asked.image0, asked.image1)]
     answer = mmgsd.load(asked.weights).match(*images, asked.xy, n=asked.n)
     described = describe_answer(answer)
     print(json.dumps(described) if asked.json else "\n".join(map(_format_query, described)))
@@ -96,14 +95,6 @@ def _draw(answer: Any, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     figure = answer.plot() if len(answer.xy) == 1 else plot_teaser({"": [answer[k] for k in range(len(answer.xy))]})
     figure.savefig(path)
-
-
-def _read_image(path: Path) -> np.ndarray:
-    try:
-        with Image.open(path) as image:
-            return np.asarray(image.convert("RGB"))
-    except UnidentifiedImageError as error:
-        raise ValueError(f"{path} is no image that can be read") from error
 
 
 def _parse_pixel(text: str) -> tuple[float, float]:

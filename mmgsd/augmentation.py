@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from mmgsd.config import TrainConfig
@@ -16,6 +19,8 @@ from mmgsd.dataset import Dataset
 from mmgsd.network import compute_input_size
 
 CACHE_SCALE = 1.25  # images are kept in memory at this multiple of the network's input size
+WAVES = 4  # that bend an image
+BEND_ITERATIONS = 12
 
 
 @dataclass(frozen=True)
@@ -41,13 +46,60 @@ class Batch:
     inside: Tensor  # (B, P) bool
 
 
-def sample_affine(
-    size: tuple[int, int], rng: np.random.Generator, *, rotate: bool = True, scale: float = 0.2, shift: float = 0.06
-) -> np.ndarray:
-    """A random similarity of the image plane about the image's centre, as a (2, 3) matrix on full-image px.
+@dataclass(frozen=True)
+class Warp:
+    """A smooth map of the image plane, in full-image px: an affine one, then gentle waves that bend it.
+
+    Built from where a pixel of the new image comes from, ``find_source``; ``move`` is the inverse.
+    """
+
+    affine: np.ndarray  # (2, 3)
+    amplitudes: np.ndarray  # (K, 2) px
+    wave_vectors: np.ndarray  # (K, 2) rad/px
+    phases: np.ndarray  # (K,) rad
+
+    def find_source(self, xy: np.ndarray) -> np.ndarray:
+        """Old px of new px (..., 2)."""
+        inverse = np.linalg.inv(self.affine[:, :2])
+        return (xy + self._bend(xy) - self.affine[:, 2]) @ inverse.T
+
+    def find_grid_source(self, columns: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """`find_source` of every pixel of a grid, (rows, columns, 2): the sine of a sum by the sines of its parts."""
+        across = columns[:, None] * self.wave_vectors[:, 0]  # (columns, K)
+        down = rows[:, None] * self.wave_vectors[:, 1] + self.phases  # (rows, K)
+        parts = np.concatenate([np.cos(down), np.sin(down)], axis=1)  # (rows, 2 K)
+        waves = np.concatenate([np.sin(across), np.cos(across)], axis=1)  # (columns, 2 K)
+        bend = np.einsum("rk,ck,kd->rcd", parts, waves, np.tile(self.amplitudes, (2, 1)), optimize=True)
+        asked = np.stack(np.meshgrid(columns, rows), axis=-1) + bend
+        return (asked - self.affine[:, 2]) @ np.linalg.inv(self.affine[:, :2]).T
+
+    def move(self, xy: np.ndarray) -> np.ndarray:
+        """New px of old px (..., 2); exact to 0.02 px."""
+        straight = xy @ self.affine[:, :2].T + self.affine[:, 2]
+        moved = straight
+        for _ in range(BEND_ITERATIONS):  # a contraction: the waves' slopes sum to 0.5 at most
+            moved = straight - self._bend(moved)
+        return moved
+
+    def mirrored(self, width: int) -> Warp:
+        """The same after the old image was mirrored, columns backwards."""
+        return dataclasses.replace(self, affine=self.affine @ [[-1, 0, width - 1], [0, 1, 0], [0, 0, 1]])
+
+    def _bend(self, xy: np.ndarray) -> np.ndarray:
+        return np.sin(xy @ self.wave_vectors.T + self.phases) @ self.amplitudes
+
+
+UNCHANGED = Warp(np.eye(2, 3), np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
+
+
+def sample_warp(
+    size: tuple[int, int], rng: np.random.Generator, *,
+    rotate: bool = True, scale: float = 0.2, shift: float = 0.06, bend: float = 0.0,
+) -> Warp:  # fmt: skip
+    """A random similarity of the image plane about the image's centre, bent by ``WAVES`` random waves.
 
     Angle uniform over the circle (0 without ``rotate``), size times exp(± ``scale``), moved by up to ``shift`` of the
-    image's size.
+    image's size; the waves are half to a whole image long and stretch or squeeze by up to ``bend`` in all.
     """
     width, height = size
     angle = rng.uniform(-np.pi, np.pi) if rotate else 0.0
@@ -56,30 +108,33 @@ def sample_affine(
     linear = np.array([[cosine, -sine], [sine, cosine]])
     centre = np.array([(width - 1) / 2, (height - 1) / 2])
     move = rng.uniform(-shift, shift, 2) * (width, height)
-    return np.column_stack([linear, centre - linear @ centre + move])
+    affine = np.column_stack([linear, centre - linear @ centre + move])
+    direction, towards = rng.uniform(0, 2 * np.pi, (2, WAVES))
+    number = rng.uniform(1, 2, WAVES) * 2 * np.pi / max(size)  # rad/px
+    amplitude = rng.uniform(0, bend / WAVES, WAVES) / number
+    waves, pushes = (np.stack([np.cos(a), np.sin(a)], axis=-1) for a in (direction, towards))
+    return Warp(affine, amplitude[:, None] * pushes, number[:, None] * waves, rng.uniform(0, 2 * np.pi, WAVES))
 
 
-def warp_points(xy: np.ndarray, affine: np.ndarray) -> np.ndarray:
-    """Apply a (2, 3) ``affine`` to (..., 2) px."""
-    return xy @ affine[:, :2].T + affine[:, 2]
+def warp_images(
+    images: Sequence[np.ndarray], warp: Warp, full: tuple[int, int], size: tuple[int, int]
+) -> list[np.ndarray]:
+    """Apply a ``warp`` to (possibly smaller) copies of an image and resample them to ``size``.
 
-
-def warp_image(image: np.ndarray, affine: np.ndarray, full: tuple[int, int], size: tuple[int, int]) -> np.ndarray:
-    """Apply a full-image ``affine`` to a (possibly smaller) copy of the image and resample it to ``size``.
-
-    ``image`` (h, w, 3) uint8 or (h, w) uint8, of any resolution of an image of ``full`` = (W, H) px. What enters from
-    outside is mirrored background, or nothing (0) for a mask. Returns (size[1], size[0], …).
+    ``images`` (h, w, 3) uint8 or (h, w) uint8, all of one resolution, of an image of ``full`` = (W, H) px. What
+    enters from outside is mirrored background, or nothing (0) for a mask. Returns (size[1], size[0], …) each.
     """
-    to_full = compute_scaling((image.shape[1], image.shape[0]), full)
-    matrix = compute_scaling(full, size) @ np.vstack([affine, [0, 0, 1]]) @ to_full
-    border = cv2.BORDER_CONSTANT if image.ndim == 2 else cv2.BORDER_REFLECT_101
-    return cv2.warpAffine(image, matrix[:2], size, flags=cv2.INTER_LINEAR, borderMode=border)
+    columns, rows = (_scale(np.arange(n), n, whole) for n, whole in zip(size, full, strict=True))
+    found = warp.find_grid_source(columns, rows)
+    source = _scale(found, full, images[0].shape[1::-1]).astype(np.float32)
+    borders = [cv2.BORDER_CONSTANT if image.ndim == 2 else cv2.BORDER_REFLECT_101 for image in images]
+    return [cv2.remap(image, source, None, cv2.INTER_LINEAR, borderMode=border)
+            for image, border in zip(images, borders, strict=True)]  # fmt: skip
 
 
-def compute_scaling(source: tuple[int, int], target: tuple[int, int]) -> np.ndarray:
-    """(3, 3) matrix from px of a ``source``-sized image to px of its ``target``-sized copy, pixel centres integer."""
-    sx, sy = target[0] / source[0], target[1] / source[1]
-    return np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1]])
+def _scale(positions: np.ndarray, source: ArrayLike, target: ArrayLike) -> np.ndarray:
+    """Px of an image with ``source`` px a side as px of its copy with ``target``, pixel centres integer."""
+    return (positions + 0.5) * (np.asarray(target) / np.asarray(source)) - 0.5
 
 
 def jitter_colours(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -121,16 +176,16 @@ def make_batch(
     visible = images.visible[indices].copy()  # (B, P)
     pixels, masks, points = [], [], []
     for k, index in enumerate(indices):
-        affine, xy = np.eye(2, 3), images.xy[index]
+        warp, xy = UNCHANGED, images.xy[index]
         if config.augment:
-            affine = sample_affine(images.size, rng, rotate=config.rotate)
+            warp = sample_warp(images.size, rng, rotate=config.rotate, bend=config.bend)
             if images.mirror is not None and rng.random() < 0.5:
-                affine = affine @ [[-1, 0, images.size[0] - 1], [0, 1, 0], [0, 0, 1]]
+                warp = warp.mirrored(images.size[0])
                 xy, visible[k] = xy[images.mirror], visible[k][images.mirror]
-        image = warp_image(images.images[index], affine, images.size, size)
+        image, mask = warp_images([images.images[index], images.masks[index]], warp, images.size, size)
         pixels.append(jitter_colours(image, rng) if config.augment else image)
-        masks.append(warp_image(images.masks[index], affine, images.size, size) > 127)
-        points.append(warp_points(xy, affine))
+        masks.append(mask > 127)
+        points.append(warp.move(xy))
     xy = np.stack(points)
     inside = np.all((xy > -0.5) & (xy < np.array(images.size) - 0.5), axis=-1)
     image = torch.from_numpy(np.stack(pixels)).to(device).permute(0, 3, 1, 2).float() / 255

@@ -12,6 +12,7 @@ import hashlib
 import json
 import math
 import os
+import re
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -19,7 +20,8 @@ OBJECTS = ("cloth", "rope")
 METHODS = ("pcl", "spcl", "unimodal", "mmgsd")
 IMAGE_SIZE = {"cloth": (485, 485), "rope": (640, 480)}  # (width, height) px, paper section "Quantitative Results"
 DEFAULT_GROUP = {"cloth": "c4", "rope": "c2"}
-N_POINTS = 625  # material points of each object
+OWN_GROUP = "own"  # of any other object: what its file says
+N_POINTS = 625  # material points of the cloth and the rope
 
 Config = TypeVar("Config", bound="RenderConfig | TrainConfig | EvaluateConfig")
 
@@ -27,6 +29,13 @@ Config = TypeVar("Config", bound="RenderConfig | TrainConfig | EvaluateConfig")
 def _check(name: str, value: Any, accepted: str, ok: bool) -> None:
     if not ok:
         raise ValueError(f"{name} must be {accepted}, got {value!r}")
+
+
+def _check_object(name: str) -> None:
+    """The cloth, the rope, or a name that an object of the user's own may have."""
+    close = difflib.get_close_matches(str(name), OBJECTS, n=1)
+    if name not in OBJECTS and (close or not re.fullmatch("[a-z][a-z0-9_-]*", str(name))):
+        _check_choice("object", name, (*OBJECTS, "the name of a file in data/objects"))
 
 
 def _check_choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
@@ -54,7 +63,7 @@ def _check_types(config: Any) -> None:
 class RenderConfig:
     """What a rendered data set holds."""
 
-    object: str = "cloth"
+    object: str = "cloth"  # or "rope", or the name of a file in data/objects (see `mmgsd.sheet`)
     train_images: int = 60
     test_images: int = 20
     views: int = 10  # images of one simulation, each with its own camera, light and material
@@ -65,7 +74,7 @@ class RenderConfig:
 
     def __post_init__(self) -> None:
         _check_types(self)
-        _check_choice("object", self.object, OBJECTS)
+        _check_object(self.object)
         for name in ("train_images", "test_images", "views", "samples"):
             _check(name, getattr(self, name), "at least 1", getattr(self, name) >= 1)
         _check("rotation_deg", self.rotation_deg, "in (0, 180]", 0 < self.rotation_deg <= 180)
@@ -74,7 +83,7 @@ class RenderConfig:
 
     @property
     def size(self) -> tuple[int, int]:
-        """(width, height) of an image in px."""
+        """(width, height) of an image of the cloth or the rope in px."""
         return IMAGE_SIZE[self.object]
 
 
@@ -84,45 +93,58 @@ class TrainConfig:
 
     object: str = "cloth"
     method: str = "mmgsd"
-    group: str = ""  # symmetry group the matches come from; "" is the object's own (c4 or c2)
+    group: str = ""  # symmetry group the matches come from; "" is the object's own (c4, c2, or its file's)
     network: str = "lite0"  # or "resnet34", the contrastive papers' reference
     trunk_weights: str = ""  # safetensors file of ImageNet weights for resnet34, torchvision's names; "": random
     descriptor_dim: int = 32
     input_px: int = 128  # the longer side of the network's input
     steps: int = 600
     batch: int = 16  # images a step
-    pairs: int = 60  # ordered pairs of a batch's images
+    groups: int = 1  # parts of a batch normalised and paired each by itself; as many processes can share a step
+    pairs: int = 60  # ordered pairs of images a step
     queries: int = 64  # source points a pair
     learning_rate: float = 1.5e-3
     schedule: str = "cosine"  # or "step": times 0.9 every 250 steps, the reference of the contrastive losses
     weight_decay: float = 0.02
     sigma_px: float = 1.0  # std of a target mode at the end of training
     sigma_start_px: float = 48.0  # std at its start; annealed geometrically over the first two thirds
-    prototype_weight: float = 1.0  # of the dense supervision by single images (unimodal and mmgsd); 0: pairs only
+    prototype_weight: float = -1.0  # of the dense supervision by single images; -1: 0 for pcl and spcl, 1 for others
     margin: float = 0.5  # contrastive losses only
     non_matches: int = 150  # a match, half of them on the object (contrastive losses only)
     augment: bool = True
+    bend: float = 0.0  # augmentation stretches and squeezes images along random waves, by up to this share
     rotate: bool = True  # augmentation turns images by any angle; off where the rotation limit is the experiment
     seed: int = 0
 
     def __post_init__(self) -> None:
         _check_types(self)
-        _check_choice("object", self.object, OBJECTS)
+        _check_object(self.object)
         _check_choice("method", self.method, METHODS)
         _check_choice("network", self.network, ("lite0", "resnet34"))
         _check_choice("schedule", self.schedule, ("cosine", "step"))
         accepted = "'' for lite0, which brings its own"
         _check("trunk_weights", self.trunk_weights, accepted, not self.trunk_weights or self.network == "resnet34")
-        _set_frozen(self, "group", self.group or DEFAULT_GROUP[self.object])
+        _set_frozen(self, "group", self.group or DEFAULT_GROUP.get(self.object, OWN_GROUP))
+        weight = self.prototype_weight
+        _check("prototype_weight", weight, "at least 0, or -1 for the method's own", weight >= 0 or weight == -1)
         for name in ("descriptor_dim", "steps", "pairs", "queries"):
             _check(name, getattr(self, name), "at least 1", getattr(self, name) >= 1)
         _check("non_matches", self.non_matches, "at least 2 (on and off the object)", self.non_matches >= 2)
         for name in ("learning_rate", "sigma_px", "sigma_start_px", "margin"):
             _check(name, getattr(self, name), "greater than 0", getattr(self, name) > 0)
         _check("batch", self.batch, "at least 2 (a pair)", self.batch >= 2)
+        each = f"a divisor of batch and pairs that leaves at least 2 of {self.batch} images and a pair in each"
+        divides = self.groups >= 1 and self.batch % self.groups == 0 == self.pairs % self.groups
+        _check("groups", self.groups, each, divides and self.batch // self.groups >= 2)
         _check("input_px", self.input_px, "at least 64", self.input_px >= 64)
+        _check("bend", self.bend, "in [0, 0.5]", 0 <= self.bend <= 0.5)
         for name in ("weight_decay", "seed"):
             _check(name, getattr(self, name), "at least 0", getattr(self, name) >= 0)
+
+    @property
+    def dense_weight(self) -> float:
+        """Weight of the dense supervision that the method gets."""
+        return float(self.method in ("unimodal", "mmgsd")) if self.prototype_weight < 0 else self.prototype_weight
 
     @property
     def name(self) -> str:
@@ -201,8 +223,8 @@ PRESETS = {
     "paper": _preset(
         "paper",
         train_images=3500, test_images=500, views={"cloth": 5, "rope": 10},
-        train={"steps": 12000}, rope={"input_px": 160},
-        ablation={"steps": 2000}, sigmas=(1.0, 2.0, 4.0, 8.0, 16.0),
+        train={"steps": 4000, "bend": 0.5}, rope={"input_px": 160},
+        ablation={"steps": 1000}, sigmas=(1.0, 2.0, 4.0, 8.0, 16.0),
         evaluate={"pairs": 500, "points": 625},
     ),
 }  # fmt: skip

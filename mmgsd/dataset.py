@@ -19,7 +19,6 @@ import numpy as np
 import pandas as pd
 from PIL import Image, UnidentifiedImageError
 
-from mmgsd.config import N_POINTS
 from mmgsd.symmetry import SymmetryGroup
 
 FORMAT = 1
@@ -36,7 +35,7 @@ class DatasetError(ValueError):
 class Dataset:
     """One split of a data set, labels in memory, images read when asked for.
 
-    ``xy`` (N, 625, 2) px, ``visible`` (N, 625) bool, ``episode`` (N,) simulation of each image.
+    ``xy`` (N, P, 2) px, ``visible`` (N, P) bool, ``episode`` (N,) simulation of each image; P is 625 of cloth or rope.
     """
 
     folder: Path
@@ -57,14 +56,19 @@ class Dataset:
         """(width, height) of every image in px."""
         return tuple(self.info["size"])
 
+    @property
+    def n_points(self) -> int:
+        """Number of material points P."""
+        return _count_points(self.info)
+
     @cached_property
     def xy(self) -> np.ndarray:
-        """(N, 625, 2) float32 px, the projected material points."""
+        """(N, P, 2) float32 px, the projected material points."""
         return np.stack([np.reshape(v, (-1, 2)) for v in self.labels.xy]).astype(np.float32)
 
     @cached_property
     def visible(self) -> np.ndarray:
-        """(N, 625) bool, points that the camera sees."""
+        """(N, P) bool, points that the camera sees."""
         return np.stack(self.labels.visible.to_list()).astype(bool)
 
     @cached_property
@@ -87,12 +91,13 @@ class Dataset:
 
     @property
     def mirror(self) -> np.ndarray | None:
-        """Where each material point (625,) goes in a mirror image, None for an object that has no mirror image."""
+        """Where each material point (P,) goes in a mirror image, None for an object that has no mirror image."""
         if self.info.get("mirror") is None:
             return None
         points = np.asarray(self.info["mirror"])
-        if not np.array_equal(np.sort(points), np.arange(N_POINTS)):
-            raise DatasetError(f"{self.folder / 'dataset.json'}: mirror must hold each of 0 to {N_POINTS - 1} once")
+        if not np.array_equal(np.sort(points), np.arange(self.n_points)):
+            place, last = self.folder / "dataset.json", self.n_points - 1
+            raise DatasetError(f"{place}: mirror must hold each of 0 to {last} once")
         return points
 
     def load_image(self, index: int) -> np.ndarray:
@@ -223,6 +228,10 @@ def _read_info(path: Path) -> dict:
     return info
 
 
+def _count_points(info: dict) -> int:
+    return len(info["symmetry"][info["default_group"]][0])
+
+
 def _read_labels(path: Path, info: dict) -> pd.DataFrame:
     try:
         labels = pd.read_parquet(path)
@@ -234,7 +243,8 @@ def _read_labels(path: Path, info: dict) -> pd.DataFrame:
     counts = labels.split.value_counts().to_dict()
     if counts != info["images"]:
         raise DatasetError(f"{path} has {counts} rows a split, dataset.json says {info['images']}")
-    for column, length in {"xy": 2 * N_POINTS, "visible": N_POINTS, "intrinsics": 9, "camera_pose": 16}.items():
+    points = _count_points(info)
+    for column, length in {"xy": 2 * points, "visible": points, "intrinsics": 9, "camera_pose": 16}.items():
         wrong = labels.index[labels[column].map(np.size) != length]
         if len(wrong):
             raise DatasetError(f"{path}: {column} of row {wrong[0]} is not of length {length}")

@@ -61,8 +61,8 @@ def save_figure(figure: Figure, path: Path, kinds: Sequence[str] = ("pdf", "png"
 
 
 def compute_point_colours(object: str, count: int = N_POINTS) -> np.ndarray:
-    """(count, 3) colours: along the length of a rope, or mixed from those of a square grid's four corners."""
-    if object == "rope":
+    """(count, 3) colours: mixed from those of a square cloth's four corners, else in the order of the points."""
+    if object != "cloth":
         return colormaps["turbo"](np.linspace(0.05, 0.95, count))[:, :3]
     side = round(count**0.5)
     row, column = (v.ravel()[:, None] for v in np.mgrid[0 : 1 : side * 1j, 0 : 1 : side * 1j])

@@ -16,7 +16,7 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from mmgsd.baselines import BaselineMatcher, list_baselines
-from mmgsd.config import N_POINTS, EvaluateConfig, digest
+from mmgsd.config import EvaluateConfig, digest
 from mmgsd.dataset import Dataset, load_dataset, sample_pairs
 from mmgsd.matching import Matcher, read_heatmap
 from mmgsd.metrics import aggregate, compute_mahalanobis2, compute_query_errors
@@ -26,6 +26,7 @@ from mmgsd.network import compute_cell_centres
 BASELINES = list_baselines()  # hand-made descriptors that this OpenCV has
 CHANCE = ("centre", "random")
 BANDWIDTHS = (1 / 64, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2)  # of a contrastive heatmap, in margins
+MEASURES = "2"  # to be raised where the same answers are measured in another way
 TEMPERATURES = (0.1, 10.0)  # range in which the calibrated one is sought
 
 Answer = Callable[[int, int, np.ndarray, np.ndarray], tuple[Mixture, Tensor]]
@@ -73,8 +74,8 @@ def evaluate_baseline(
 def load_queries(path: Path) -> pd.DataFrame:
     """One method's table, a row a query.
 
-    pair, image0, image1, point; visible (source), n and hidden (true matches), rmse_px, nearest_px, best_px, pck@…,
-    entropy (nats), outside (share of the heatmap), mahalanobis2 (a list of n).
+    pair, image0, image1, point; visible (source), n and hidden (true matches), rmse_px, nearest_px, best_px, swapped,
+    pck@…, entropy (nats), outside (share of the heatmap), mahalanobis2 (a list of n).
     """
     return pd.read_parquet(path)
 
@@ -131,7 +132,7 @@ def calibrate_temperature(
     ``data`` must not have been trained on. Leaves it set on the matcher and returns it.
     """
     chosen = sample_pairs(data.episode, pairs, np.random.default_rng(seed))
-    descriptors, points = _describe(matcher, data, np.unique(chosen)), choose_points(points)
+    descriptors, points = _describe(matcher, data, np.unique(chosen)), choose_points(points, data.n_points)
     orbits = data.group(matcher.config.group).permutations[:, points].T  # (S, G)
     matcher.temperature, logits, true = 1.0, [], []
     for first, second in chosen:
@@ -158,15 +159,15 @@ def _find_cells(xy: np.ndarray, size: tuple[int, int], shape: tuple[int, int]) -
     return row * shape[1] + column
 
 
-def choose_points(count: int) -> np.ndarray:
-    """``count`` material points of 625 spread evenly in order; all of them at 625."""
-    return np.unique(np.linspace(0, N_POINTS - 1, count).round().astype(int))
+def choose_points(count: int, total: int) -> np.ndarray:
+    """``count`` of ``total`` material points spread evenly in order; all of them where there are no more."""
+    return np.unique(np.linspace(0, total - 1, min(count, total)).round().astype(int))
 
 
 def _ask(answer: Answer, data: Dataset, config: EvaluateConfig, group: str, progress: bool, name: str) -> pd.DataFrame:
     """Ask ``answer`` every query and compare with the truth; one row a query."""
     pairs = _draw_pairs(data, config)
-    symmetry, points = data.group(group), choose_points(config.points)
+    symmetry, points = data.group(group), choose_points(config.points, data.n_points)
     orbits = [symmetry.distinct_modes(int(p)) for p in points]
     count = np.array([len(o) for o in orbits])
     frames = []
@@ -245,7 +246,8 @@ def _describe_batches(matcher: Matcher, data: Dataset, indices: np.ndarray, batc
 
 def _describe_question(data: Dataset, config: EvaluateConfig, group: str, method: str) -> dict[str, str]:
     """What a table of answers depends on; kept in it, so that a stale one is noticed."""
-    return {"data": data.fingerprint, "config": digest(config), "group": data.group(group).name, "method": method}
+    asked = {"data": data.fingerprint, "config": digest(config), "group": data.group(group).name}
+    return {**asked, "method": method, "measures": MEASURES}
 
 
 def _is_answered(out: Path, question: dict[str, str]) -> bool:

@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
+from PIL import Image, ImageOps, UnidentifiedImageError
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
@@ -247,6 +248,15 @@ def check_question(
     """Both images as (H, W, 3) uint8 and the pixels as (S, 2) float32; ValueError names the argument that is wrong."""
     image0, image1 = to_rgb(image0, "image0"), to_rgb(image1, "image1")
     return image0, image1, check_pixels(xy, (image0.shape[1], image0.shape[0]))
+
+
+def read_image(path: Path | str) -> np.ndarray:
+    """(H, W, 3) uint8 of an image file, upright as its camera noted; ValueError for a file that is no image."""
+    try:
+        with Image.open(path) as image:
+            return np.asarray(ImageOps.exif_transpose(image).convert("RGB"))
+    except UnidentifiedImageError as error:
+        raise ValueError(f"{path} is no image that can be read") from error
 
 
 def to_rgb(image: np.ndarray, name: str = "image") -> np.ndarray:

@@ -29,8 +29,18 @@ def assign_modes(modes: np.ndarray, true: np.ndarray) -> np.ndarray:
 
 def compute_mode_errors(modes: np.ndarray, true: np.ndarray) -> np.ndarray:
     """Distances in px (S, n) of true modes to the predicted ones paired with them, both (S, n, 2) px."""
-    paired = np.take_along_axis(modes, assign_modes(modes, true)[..., None], 1)
-    return np.linalg.norm(true - paired, axis=-1)
+    return np.linalg.norm(true - _pair(modes, true), axis=-1)
+
+
+def compute_swaps(modes: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """Which predicted modes lie nearer to another true one than to their own, (S, n) bool in the true ones' order."""
+    distances = np.linalg.norm(true[:, None] - _pair(modes, true)[:, :, None], axis=-1)  # (S, predicted, true)
+    return distances.min(-1) < np.diagonal(distances, axis1=1, axis2=2)
+
+
+def _pair(modes: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """The predicted modes (S, n, 2) in the order of the true ones that they are paired with."""
+    return np.take_along_axis(modes, assign_modes(modes, true)[..., None], 1)
 
 
 def compute_mahalanobis2(modes: np.ndarray, covariances: np.ndarray, true: np.ndarray) -> np.ndarray:
@@ -49,7 +59,8 @@ def compute_query_errors(modes: np.ndarray, covariances: np.ndarray, true: np.nd
 
     ``rmse_px`` is the root mean square over a query's modes (the paper's formula lacks the root of its name),
     ``nearest_px`` the distance of the most probable mode to the nearest true one, ``best_px`` that of the mode with the
-    least spread (the first where no spread is known), ``pck@5px`` … the share of true modes found that near.
+    least spread (the first where no spread is known), ``pck@5px`` … the share of true modes found that near,
+    ``swapped`` that of modes nearer to a wrong point of the orbit than to their own.
     """
     errors = compute_mode_errors(modes, true)
     nearest = np.linalg.norm(true - modes[:, :1], axis=-1).min(1)
@@ -60,6 +71,7 @@ def compute_query_errors(modes: np.ndarray, covariances: np.ndarray, true: np.nd
         "rmse_px": np.sqrt(np.square(errors).mean(1)),
         "nearest_px": nearest,
         "best_px": np.linalg.norm(true - best, axis=-1).min(1),
+        "swapped": compute_swaps(modes, true).mean(1),
         **shares,
     }
 
@@ -73,6 +85,7 @@ def aggregate(queries: pd.DataFrame) -> dict[str, float]:
         "median": error.median(),
         "nearest_mean": queries.nearest_px.mean(),
         "best_mean": queries.best_px.mean(),
+        "swap_rate": queries.swapped.mean(),
         **{f"pck@{t}px": queries[f"pck@{t}px"].mean() for t in PCK_PX},
     }
     return {name: round(float(value), 4) for name, value in summary.items()} | {"queries": len(queries)}

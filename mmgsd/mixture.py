@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-CYCLES, ROUND = 30, 3  # of three EM steps and a leap, at most; a query at rest is left alone after each round
-TOLERANCE_CELLS = 0.005  # the most that a mode at rest moves in a round
+CYCLES, ROUND = 60, 3  # of three EM steps and a leap, at most; a query at rest is left alone after each round
+TOLERANCE_CELLS = 0.002  # the most that a mode at rest moves in a round
 LEAP = 16.0  # the longest leap, in steps
 KERNEL_CELLS = 2.0  # std of the kernel that finds the initial peaks
 SPREAD = (1 / 12, 10 / 12, 1 / 12)  # of a cell's mass: to second order what bilinear interpolation to pixels does

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import hashlib
 import importlib.metadata
 import io
 import json
@@ -24,8 +25,9 @@ import pandas as pd
 from dask.distributed import Client, LocalCluster, as_completed
 from tqdm.auto import tqdm
 
-from mmgsd.config import DEFAULT_GROUP, RenderConfig
+from mmgsd.config import DEFAULT_GROUP, OBJECTS, OWN_GROUP, RenderConfig, find_root
 from mmgsd.dataset import FORMAT, SPLITS, load_dataset
+from mmgsd.sheet import Sheet, load_sheet
 from mmgsd.symmetry import GRID_GROUPS, LINE_GROUPS, load_group, load_mirror
 
 IMAGES_A_BATCH = 30  # a child process ends after about so many, which bounds its memory
@@ -45,6 +47,8 @@ def render_dataset(
 
     ``workers`` processes on this machine (0: one a core), or the ``scheduler`` of an existing Dask cluster by its
     address. Finished batches of a killed call are kept. ValueError where the folder holds another configuration.
+
+    Objects other than ``cloth`` and ``rope`` are read from ``data/objects/<name>.json`` (`mmgsd.sheet`).
     """
     if (folder / "dataset.json").is_file() and not overwrite:
         info = load_dataset(folder).info
@@ -66,15 +70,21 @@ def render_dataset(
     return folder
 
 
+def load_object(config: RenderConfig) -> Sheet | None:
+    """The sheet that an object's file describes; None for the cloth and the rope, which need none."""
+    return None if config.object in OBJECTS else load_sheet(find_root() / "data" / "objects" / f"{config.object}.json")
+
+
 def plan_batches(config: RenderConfig) -> dict[str, dict]:
     """The jobs of a data set by name; they depend on the configuration alone, never on who renders them."""
-    jobs = {}
+    jobs, sheet = {}, load_object(config)
+    described = None if sheet is None else sheet.to_dict()
     for split, images in zip(SPLITS, (config.train_images, config.test_images), strict=True):
         views = [min(config.views, images - start) for start in range(0, images, config.views)]
         batch = max(1, IMAGES_A_BATCH // config.views)
         for start in range(0, len(views), batch):
             episodes = [[start + i, n] for i, n in enumerate(views[start : start + batch])]
-            job = {"config": dataclasses.asdict(config), "split": split, "episodes": episodes}
+            job = {"config": dataclasses.asdict(config), "split": split, "episodes": episodes, "sheet": described}
             jobs[f"{split}_{start:06d}"] = job
     return jobs
 
@@ -103,7 +113,7 @@ def _connect(workers: int, scheduler: str) -> Iterator[Client]:
         return
     threads = workers or os.cpu_count()  # they only wait for the children
     with _unchanged_environment(), LocalCluster(
-        n_workers=1, threads_per_worker=threads, processes=False, dashboard_address=None, silence_logs="ERROR",
+        n_workers=1, threads_per_worker=threads, processes=False, dashboard_address="127.0.0.1:0", silence_logs="ERROR",
     ) as local, Client(local) as client:  # fmt: skip
         yield client
 
@@ -140,7 +150,29 @@ def _check_same_config(config: RenderConfig, stored: dict, folder: Path) -> None
 
 def _describe(config: RenderConfig) -> dict:
     """All that decides the images."""
-    return dataclasses.asdict(config) | {"scenes": SCENES[config.object]}
+    return dataclasses.asdict(config) | {"scenes": _name_scenes(config)}
+
+
+def _name_scenes(config: RenderConfig) -> int | str:
+    """Version of the object's scenes; of an object of the user's own, with the digest of what its file describes."""
+    sheet = load_object(config)
+    if sheet is None:
+        return SCENES[config.object]
+    return f"{SCENES['cloth']}-{hashlib.sha256(json.dumps(sheet.to_dict()).encode()).hexdigest()[:8]}"
+
+
+def _describe_symmetry(config: RenderConfig) -> dict:
+    """Image size, groups and mirror of the object, as dataset.json holds them."""
+    sheet = load_object(config)
+    if sheet is None:
+        groups = {name: load_group(config.object, name).permutations for name in GROUPS[config.object]}
+        default, mirror, size = DEFAULT_GROUP[config.object], load_mirror(config.object), config.size
+    else:
+        groups = {"identity": np.arange(len(sheet.rest))[None], OWN_GROUP: sheet.group.permutations}
+        default, mirror, size = OWN_GROUP, sheet.mirror, sheet.size
+    symmetry = {name: permutations.tolist() for name, permutations in groups.items()}
+    mirror = None if mirror is None else mirror.tolist()
+    return {"size": list(size), "default_group": default, "symmetry": symmetry, "mirror": mirror}
 
 
 def _claim(config: RenderConfig, partial: Path) -> None:
@@ -161,17 +193,13 @@ def _assemble(config: RenderConfig, partial: Path) -> Path:
     rows = [row for name in plan_batches(config) for row in _unpack(partial / f"{name}.zip", folder)]
     labels = pd.DataFrame(rows)
     labels.to_parquet(folder / "labels.parquet", index=False)
-    groups = {name: load_group(config.object, name).permutations.tolist() for name in GROUPS[config.object]}
     info = {
         "format": FORMAT,
         "object": config.object,
-        "size": list(config.size),
-        "default_group": DEFAULT_GROUP[config.object],
         "images": labels.split.value_counts().to_dict(),
         "config": dataclasses.asdict(config),
-        "versions": {"scenes": SCENES[config.object], **_list_versions()},
-        "symmetry": groups,
-        "mirror": load_mirror(config.object).tolist(),
+        "versions": {"scenes": _name_scenes(config), **_list_versions()},
+        **_describe_symmetry(config),
     }
     (folder / "dataset.json").write_text(json.dumps(info))
     return folder

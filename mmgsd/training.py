@@ -20,7 +20,7 @@ from torch.nn import functional as F
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from tqdm.auto import tqdm
 
-from mmgsd import losses
+from mmgsd import distributed, losses
 from mmgsd.augmentation import Batch, load_training_images, make_batch
 from mmgsd.config import TrainConfig
 from mmgsd.dataset import Dataset, hold_out, load_dataset
@@ -64,6 +64,9 @@ def train_model(
 
     The log (CSV) has a row a step; with ``validate_every`` steps, also the RMSE (px) on held-out simulations.
 
+    Under ``torchrun`` the processes share every step's groups (``config.groups`` must be a multiple of their number),
+    and the first one writes the files. The losses and gradients are those of a single process.
+
     A finished model is returned as it is, a killed run goes on from its last checkpoint and ends with the same weights.
     Raises ValueError where the data set is of another object or does not store the symmetry group.
     """
@@ -77,24 +80,32 @@ def train_model(
         shutil.rmtree(folder)
     if data.object != config.object:
         raise ValueError(f"object is {config.object!r}, but {dataset} shows a {data.object}")
-    run = _Run(config, data, folder, torch.device(device or find_device()), validate_every)
-    run.resume()
-    bar = tqdm(range(run.step, config.steps), desc=config.name, disable=not progress, leave=False)
-    for _ in bar:
-        bar.set_postfix(loss=f"{run.advance():.3f}", refresh=False)
-    return run.finish(weights)
+    with distributed.joined(config.groups, device or find_device()) as team:
+        run = _Run(config, data, folder, team, validate_every)
+        run.resume()
+        shown = progress and team.rank == 0
+        bar = tqdm(range(run.step, config.steps), desc=config.name, disable=not shown, leave=False)
+        for _ in bar:
+            bar.set_postfix(loss=f"{run.advance():.3f}", refresh=False)
+        if team.rank == 0:
+            run.finish(weights)
+        team.wait()
+    return weights
 
 
 def compute_loss(
-    config: TrainConfig, descriptors: Tensor, batch: Batch, permutations: Tensor, size: tuple[int, int], step: int
-) -> Tensor:
-    """The configured method's loss of a batch: every image is a source and a target of others.
+    config: TrainConfig, descriptors: Tensor, batch: Batch, permutations: Tensor, size: tuple[int, int], step: int,
+    group: int = 0,
+) -> Tensor:  # fmt: skip
+    """The configured method's loss of a group of a batch: every image is a source and a target of others in it.
 
-    ``descriptors`` (B, D, h, w), ``permutations`` (G, P) of the matches the method knows. Randomness comes from seed
-    and step.
+    ``descriptors`` (B, D, h, w), ``permutations`` (G, P) of the matches the method knows. Randomness comes from seed,
+    step and the group's number.
     """
-    generator = torch.Generator(descriptors.device).manual_seed(config.seed * 1_000_003 + step)
-    pair = _sample_batch_pairs(len(descriptors), config.pairs, generator, descriptors.device)  # (2, K)
+    seed = (config.seed * 1_000_003 + step) * config.groups + group
+    generator = torch.Generator(descriptors.device).manual_seed(seed)
+    pairs = config.pairs // config.groups
+    pair = _sample_batch_pairs(len(descriptors), pairs, generator, descriptors.device)  # (2, K)
     points = torch.multinomial(batch.askable[pair[0]].float() + 1e-9, config.queries, True, generator=generator)
     orbit = permutations[:, points].permute(1, 2, 0)  # (K, Q, G)
     sampled = sample_descriptors(descriptors, batch.xy, size)  # (B, P, D)
@@ -117,11 +128,12 @@ class _Run:
     """A training run that can be killed between any two steps."""
 
     def __init__(
-        self, config: TrainConfig, data: Dataset, folder: Path, device: torch.device, validate_every: int = 0
+        self, config: TrainConfig, data: Dataset, folder: Path, team: distributed.Team, validate_every: int = 0
     ) -> None:
-        self.config, self.folder, self.validate_every = config, folder, validate_every
+        self.config, self.folder, self.team, self.validate_every = config, folder, team, validate_every
         self.data, self.held_out = hold_out(data)  # the latter for calibration
-        self.device, self.size = device, data.size
+        self.device, self.size = team.device, data.size
+        device = team.device
         group = data.group(config.group)
         known = group.permutations[:1] if config.method in MATCHES_OF_ONE else group.permutations
         self.permutations = torch.tensor(known, device=device)
@@ -143,30 +155,41 @@ class _Run:
     def advance(self) -> float:
         """One optimiser step; saves a checkpoint every ``CHECKPOINT_SECONDS``."""
         start = time.perf_counter()
-        rng = np.random.default_rng([self.config.seed, self.step])
-        count = len(self.images.images)
-        indices = rng.choice(count, self.config.batch, replace=count < self.config.batch)
-        batch = make_batch(self.images, indices, self.config, rng, self.device)
         for group in self.optimiser.param_groups:
             group["lr"] = compute_learning_rate(self.config, self.step)
         self.network.train()
-        descriptors = self.network(batch.image.contiguous(memory_format=torch.channels_last))
-        loss = compute_loss(self.config, descriptors, batch, self.permutations, self.size, self.step)
-        if self.config.prototype_weight and self.config.method not in CONTRASTIVE:
-            loss = loss + self.config.prototype_weight * self.compute_dense_loss(descriptors, batch)
         self.optimiser.zero_grad(set_to_none=True)
-        loss.backward()
+        loss = self.team.add(sum(self.learn(group) for group in self.team.groups))
+        self.team.share_gradients([*self.trained, self.prototypes])
         torch.nn.utils.clip_grad_norm_(self.trained, 5.0)
         self.optimiser.step()
         self.average.update_parameters(self.network)
         self.step += 1
         self.seconds += time.perf_counter() - start
-        self.log.append({"step": self.step, "loss": loss.item(), "seconds": round(self.seconds, 2)})
+        self.log.append({"step": self.step, "loss": loss, "seconds": round(self.seconds, 2)})
+        if self.team.rank == 0:
+            self.keep()
+        return loss
+
+    def learn(self, group: int) -> float:
+        """Add the gradients of one group of the step's batch to the parameters'; returns its share of the loss."""
+        count, (seed, step, groups) = len(self.images.images), (self.config.seed, self.step, self.config.groups)
+        chosen = np.random.default_rng([seed, step]).choice(count, self.config.batch, count < self.config.batch)
+        own = np.array_split(chosen, groups)[group]
+        batch = make_batch(self.images, own, self.config, np.random.default_rng([seed, step, group]), self.device)
+        descriptors = self.network(batch.image.contiguous(memory_format=torch.channels_last))
+        loss = compute_loss(self.config, descriptors, batch, self.permutations, self.size, step, group)
+        if self.config.dense_weight:
+            loss = loss + self.config.dense_weight * self.compute_dense_loss(descriptors, batch)
+        (loss / groups).backward()
+        return loss.item() / groups
+
+    def keep(self) -> None:
+        """Validate and save a checkpoint where it is time."""
         if self.validate_every and self.step % self.validate_every == 0:
             self.log[-1]["rmse_px"] = round(self.validate(), 2)
         if self.seconds - self.saved_at >= CHECKPOINT_SECONDS:
             self.save()
-        return loss.item()
 
     def compute_dense_loss(self, descriptors: Tensor, batch: Batch) -> Tensor:
         """The prototypes' loss, on a part of the material points in turn."""

@@ -13,13 +13,13 @@ import torch
 
 from mmgsd import augmentation
 from mmgsd.augmentation import (
-    compute_scaling,
+    UNCHANGED,
+    Warp,
     jitter_colours,
     load_training_images,
     make_batch,
-    sample_affine,
-    warp_image,
-    warp_points,
+    sample_warp,
+    warp_images,
 )
 from mmgsd.config import TrainConfig
 from mmgsd.dataset import load_dataset
@@ -43,64 +43,91 @@ def draw_dot(xy: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 def find_dot(image: np.ndarray, full: tuple[int, int], near: np.ndarray) -> np.ndarray:
     """Centre of brightness in full-image px within 60 px of ``near``: the border mirrors the spot farther away."""
     rows, columns = np.indices(image.shape)
-    small = np.stack([columns, rows, np.ones_like(rows)], axis=-1)  # (h, w, 3)
-    xy = (small @ compute_scaling((image.shape[1], image.shape[0]), full).T)[..., :2]
+    xy = (np.stack([columns, rows], axis=-1) + 0.5) * (np.array(full) / image.shape[1::-1]) - 0.5  # (h, w, 2)
     weight = image * (np.linalg.norm(xy - near, axis=-1) < 60)
     return (xy * weight[..., None]).sum((0, 1)) / weight.sum()
 
 
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("coloured", [False, True])
+@pytest.mark.parametrize("bend", [0.0, 0.5])
 @pytest.mark.parametrize(("full", "memory", "size"), RESOLUTIONS)
 def test_labels_move_as_pixels_do(
-    full: tuple[int, int], memory: tuple[int, int], size: tuple[int, int], coloured: bool, seed: int
+    full: tuple[int, int], memory: tuple[int, int], size: tuple[int, int], bend: float, coloured: bool, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
-    affine = sample_affine(full, rng)
+    warp = sample_warp(full, rng, bend=bend)
     xy = np.array(full) / 2 + rng.uniform(-60, 60, 2)
     image = cv2.resize(draw_dot(xy, full), memory, interpolation=cv2.INTER_AREA)
     image = np.repeat(image[..., None], 3, axis=-1) if coloured else image
-    warped = warp_image(image, affine, full, size)
+    (warped,) = warp_images([image], warp, full, size)
     assert warped.shape[:2] == (size[1], size[0])
-    expected = warp_points(xy, affine)
+    expected = warp.move(xy)
     found = find_dot(warped[..., 0] if coloured else warped, full, expected)
-    np.testing.assert_allclose(found, expected, atol=0.75)
+    np.testing.assert_allclose(found, expected, atol=0.75 if bend == 0 else 1.5)  # a bent spot is not quite round
 
 
 def test_identity_changes_nothing(rng: np.random.Generator) -> None:
     image = rng.integers(0, 256, (60, 80, 3), dtype=np.uint8)
-    np.testing.assert_array_equal(warp_image(image, np.eye(2, 3), (80, 60), (80, 60)), image)
+    np.testing.assert_array_equal(warp_images([image], UNCHANGED, (80, 60), (80, 60))[0], image)
     points = rng.uniform(0, 60, (2, 7, 2))
-    np.testing.assert_array_equal(warp_points(points, np.eye(2, 3)), points)
+    np.testing.assert_array_equal(UNCHANGED.move(points), points)
 
 
 def test_points_by_hand() -> None:
     affine = np.array([[0.0, -2.0, 5.0], [2.0, 0.0, 1.0]])  # turned by 90°, doubled, moved by (5, 1)
-    np.testing.assert_array_equal(warp_points(np.array([[1.0, 3.0]]), affine), [[-1.0, 3.0]])
+    turned = dataclasses.replace(UNCHANGED, affine=affine)
+    np.testing.assert_array_equal(turned.move(np.array([[1.0, 3.0]])), [[-1.0, 3.0]])
+    np.testing.assert_array_equal(turned.find_source(np.array([[-1.0, 3.0]])), [[1.0, 3.0]])
+
+
+def test_a_wave_by_hand() -> None:
+    # what is shown at column x comes from column x + 3 sin(x / 20)
+    wave = Warp(np.eye(2, 3), np.array([[3.0, 0.0]]), np.array([[0.05, 0.0]]), np.zeros(1))
+    np.testing.assert_allclose(wave.find_source(np.array([10 * np.pi, 7.0])), [10 * np.pi + 3, 7.0])
+    np.testing.assert_allclose(wave.move(np.array([10 * np.pi + 3, 7.0])), [10 * np.pi, 7.0], atol=0.01)
+
+
+def test_the_source_of_a_grid_is_that_of_its_pixels(rng: np.random.Generator) -> None:
+    warp, columns, rows = sample_warp((640, 480), rng, bend=0.5), rng.uniform(0, 639, 7), rng.uniform(0, 479, 5)
+    expected = warp.find_source(np.stack(np.meshgrid(columns, rows), axis=-1))
+    np.testing.assert_allclose(warp.find_grid_source(columns, rows), expected)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_move_inverts_find_source(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    warp, xy = sample_warp((640, 480), rng, bend=0.5), rng.uniform(0, 480, (200, 2))
+    np.testing.assert_allclose(warp.move(warp.find_source(xy)), xy, atol=0.02)
+
+
+def test_bend_bounds_the_stretching(rng: np.random.Generator) -> None:
+    for _ in range(50):
+        warp = sample_warp((485, 485), rng, rotate=False, scale=0, bend=0.4)
+        xy = rng.uniform(0, 485, (100, 2))
+        for step in ([1e-3, 0], [0, 1e-3]):
+            change = (warp.find_source(xy + step) - warp.find_source(xy)) / 1e-3 - np.sign(step)
+            assert np.linalg.norm(change, axis=1).max() <= 0.4 + 1e-6
 
 
 def test_no_object_enters_a_mask_from_outside() -> None:
-    moved = warp_image(np.full((50, 50), 255, np.uint8), np.array([[1.0, 0, 20], [0, 1, 0]]), (50, 50), (50, 50))
+    shift = dataclasses.replace(UNCHANGED, affine=np.array([[1.0, 0, 20], [0, 1, 0]]))
+    (moved,) = warp_images([np.full((50, 50), 255, np.uint8)], shift, (50, 50), (50, 50))
     assert (moved[:, :20] == 0).all()
     assert (moved[:, 20:] == 255).all()
 
 
 def test_affine_without_rotation_only_scales_and_moves(rng: np.random.Generator) -> None:
-    affine = sample_affine((640, 480), rng, rotate=False)
+    affine = sample_warp((640, 480), rng, rotate=False).affine
     assert affine[0, 1] == affine[1, 0] == 0
     assert affine[0, 0] == affine[1, 1] > 0
 
 
 def test_affine_stays_within_its_ranges(rng: np.random.Generator) -> None:
     full, centre = np.array([640, 480]), np.array([319.5, 239.5])
-    for affine in (sample_affine((640, 480), rng) for _ in range(100)):
-        assert np.exp(-0.2) <= np.sqrt(np.linalg.det(affine[:, :2])) <= np.exp(0.2)
-        assert (np.abs(warp_points(centre, affine) - centre) <= 0.06 * full + 1e-9).all()
-
-
-def test_scaling_keeps_pixel_edges() -> None:
-    corner = compute_scaling((640, 480), (64, 48)) @ [-0.5, 479.5, 1]
-    np.testing.assert_allclose(corner, [-0.5, 47.5, 1])
+    for warp in (sample_warp((640, 480), rng) for _ in range(100)):
+        assert np.exp(-0.2) <= np.sqrt(np.linalg.det(warp.affine[:, :2])) <= np.exp(0.2)
+        assert (np.abs(warp.move(centre) - centre) <= 0.06 * full + 1e-9).all()
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -121,9 +148,10 @@ def test_jitter_leaves_its_argument_alone(rng: np.random.Generator) -> None:
 def test_randomness_is_the_generators() -> None:
     image = np.full((20, 20, 3), 90, dtype=np.uint8)
     one, two = (
-        (sample_affine((20, 20), r), jitter_colours(image, r)) for r in (np.random.default_rng(5) for _ in range(2))
+        (sample_warp((20, 20), r), jitter_colours(image, r)) for r in (np.random.default_rng(5) for _ in range(2))
     )
-    np.testing.assert_array_equal(one[0], two[0])
+    np.testing.assert_array_equal(one[0].affine, two[0].affine)
+    np.testing.assert_array_equal(one[0].phases, two[0].phases)
     np.testing.assert_array_equal(one[1], two[1])
 
 

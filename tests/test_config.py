@@ -23,7 +23,7 @@ from mmgsd.config import (
 
 OTHER = {  # another accepted value for the fields that are no plain numbers or flags
     "object": "cloth", "method": "pcl", "group": "identity", "network": "lite0", "trunk_weights": "w.safetensors",
-    "schedule": "step", "rotation_deg": 45.0,
+    "schedule": "step", "rotation_deg": 45.0, "bend": 0.25, "groups": 2,
 }  # fmt: skip
 CONFIGS = (RenderConfig(object="rope"), TrainConfig(object="rope", network="resnet34"), EvaluateConfig(points=600))
 FIELDS = [(config, field.name) for config in CONFIGS for field in dataclasses.fields(config)]
@@ -77,10 +77,15 @@ def test_unknown_preset_names_the_accepted_ones() -> None:
         (TrainConfig, {"method": "mmgds"}, "method must be one of 'pcl', .*did you mean 'mmgsd'.*got 'mmgds'"),
         (TrainConfig, {"network": "vgg"}, "network must be one of 'lite0', 'resnet34', got 'vgg'"),
         (TrainConfig, {"schedule": "none"}, "schedule must be one of 'cosine', 'step'"),
-        (RenderConfig, {"object": "towel"}, "object must be one of 'cloth', 'rope', got 'towel'"),
         (RenderConfig, {"train_images": 0}, "train_images must be at least 1"),
         (RenderConfig, {"rotation_deg": 181.0}, r"rotation_deg must be in \(0, 180\], got 181"),
         (RenderConfig, {"ball": True}, "ball must be False for a cloth, got True"),
+        (TrainConfig, {"bend": 0.6}, r"bend must be in \[0, 0.5\], got 0.6"),
+        (TrainConfig, {"groups": 5}, "groups must be a divisor of batch and pairs"),
+        (TrainConfig, {"groups": 16, "pairs": 64}, "at least 2 of 16 images"),
+        (TrainConfig, {"prototype_weight": -0.5}, "prototype_weight must be at least 0, or -1"),
+        (RenderConfig, {"object": "colth"}, "did you mean 'cloth'"),
+        (RenderConfig, {"object": "../towel"}, "the name of a file in data/objects"),
         (RenderConfig, {"seed": -1}, "seed must be at least 0, got -1"),
         (EvaluateConfig, {"points": 626}, "points must be between 1 and 625, got 626"),
         (EvaluateConfig, {"pairs": 0}, "pairs must be at least 1"),

@@ -53,7 +53,7 @@ def answer_with_the_truth(group: str, shift: float) -> object:
     def make(matcher: object, data: Dataset, config: EvaluateConfig) -> evaluation.Answer:
         def answer(first: int, second: int, xy: np.ndarray, n: np.ndarray) -> tuple[Mixture, torch.Tensor]:
             modes = np.full((len(xy), n.max(), 2), np.nan)
-            for row, point in enumerate(choose_points(CONFIG.points)):
+            for row, point in enumerate(choose_points(CONFIG.points, 625)):
                 modes[row, : n[row]] = data.xy[second, data.group(group).distinct_modes(point)[::-1]] + [shift, 0]
             covariances = torch.eye(2).repeat(*modes.shape[:2], 1, 1)
             nothing = torch.zeros(len(xy))
@@ -100,7 +100,7 @@ def test_one_row_a_query(cloth_dataset: Path, tmp_path: Path) -> None:
     queries = ask_baseline("centre", cloth_dataset, tmp_path / "centre.parquet")
     assert list(queries.columns) == [
         "pair", "image0", "image1", "point", "visible", "n", "entropy", "hidden", "outside", "mahalanobis2",
-        "rmse_px", "nearest_px", "best_px", "pck@5px", "pck@10px", "pck@20px",
+        "rmse_px", "nearest_px", "best_px", "swapped", "pck@5px", "pck@10px", "pck@20px",
     ]  # fmt: skip
     assert len(queries) == CONFIG.pairs * CONFIG.points
     assert not queries.duplicated(["pair", "point"]).any()
@@ -191,21 +191,20 @@ def test_overwrite_asks_again(cloth_dataset: Path, tmp_path: Path) -> None:
 
 
 def test_points_spread_evenly() -> None:
-    assert choose_points(5).tolist() == [0, 156, 312, 468, 624]
-    assert choose_points(625).tolist() == list(range(625))
-    assert choose_points(1).tolist() == [0]
+    assert choose_points(5, 625).tolist() == [0, 156, 312, 468, 624]
+    assert choose_points(625, 625).tolist() == list(range(625))
+    assert choose_points(1, 625).tolist() == [0]
 
 
 @pytest.mark.parametrize("count", range(1, 626, 39))
 def test_as_many_points_as_asked_for(count: int) -> None:
-    assert len(choose_points(count)) == count
+    assert len(choose_points(count, 625)) == count
 
 
 def test_summary_separates_visible_sources(tmp_path: Path) -> None:
     shares = dict.fromkeys(["pck@5px", "pck@10px", "pck@20px"], 1.0)
-    table = pd.DataFrame(
-        {"visible": [True, True, False], "rmse_px": [1.0, 3.0, 8.0], "nearest_px": 1.0, "best_px": 1.0, **shares}
-    )
+    others = {"nearest_px": 1.0, "best_px": 1.0, "swapped": 0.0, **shares}
+    table = pd.DataFrame({"visible": [True, True, False], "rmse_px": [1.0, 3.0, 8.0], **others})
     table.to_parquet(tmp_path / "mmgsd.parquet")
     summary = summarise({"mmgsd": tmp_path / "mmgsd.parquet"})["mmgsd"]
     assert (summary["rmse_mean"], summary["queries"]) == (2.0, 2)
@@ -242,7 +241,7 @@ def test_temperature_of_overconfident_and_timid_heatmaps(cloth_dataset: Path, mo
     xs, ys = compute_cell_centres((485, 485), (97, 97))
 
     def compute_heatmaps(first: None, second: int, xy: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
-        centre = torch.from_numpy(data.xy[second, choose_points(40)]) + truth["offset"]
+        centre = torch.from_numpy(data.xy[second, choose_points(40, 625)]) + truth["offset"]
         squared = (xs[None, None] - centre[:, :1, None]) ** 2 + (ys[None, :, None] - centre[:, 1:, None]) ** 2
         logits = -squared / (2 * 20.0**2) / matcher.temperature
         return logits.flatten(1).softmax(-1).view(-1, 97, 97)

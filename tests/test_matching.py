@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 import torch
 from heatmaps import CELL_PX, CELLS, CORNERS, SIZE, draw_mixture, one_cell
+from PIL import Image
 from safetensors.torch import save_file
 
 from mmgsd.config import TrainConfig
-from mmgsd.matching import Match, Matcher, compute_entropy, compute_heatmap, make_match
+from mmgsd.matching import Match, Matcher, compute_entropy, compute_heatmap, make_match, read_image
 from mmgsd.network import build_network, compute_cell_centres
 
 CONFIG = TrainConfig(input_px=64, descriptor_dim=8)
@@ -239,3 +240,12 @@ def test_best_of_nothing() -> None:
 def test_best_of_other_arguments(name: str, bad: float) -> None:
     with pytest.raises(ValueError, match=f"{name} must be .*, got {bad}"):
         answer(one_cell(3, 3), 1).best(**{name: bad})
+
+
+def test_photographs_are_read_upright(tmp_path: Path) -> None:
+    shown = np.zeros((4, 6, 3), np.uint8)
+    shown[0] = 255
+    exif = Image.Exif()
+    exif[0x0112] = 6  # stored turned: to be turned by 90° clockwise when shown
+    Image.fromarray(np.rot90(shown)).save(tmp_path / "photo.png", exif=exif)
+    np.testing.assert_array_equal(read_image(tmp_path / "photo.png"), shown)

@@ -11,7 +11,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from mmgsd.metrics import aggregate, compute_mahalanobis2, compute_mode_errors, compute_query_errors
+from mmgsd.metrics import (
+    aggregate,
+    compute_mahalanobis2,
+    compute_mode_errors,
+    compute_query_errors,
+    compute_swaps,
+)
 
 TRUE = np.array([[[0.0, 0.0], [100.0, 0.0]]])
 MODES = np.array([[[100.0, 8.0], [3.0, 4.0]]])  # 8 px from the second, 5 px from the first
@@ -38,7 +44,7 @@ def test_query_metrics_by_hand() -> None:
     metrics = compute_query_errors(MODES, COVARIANCES, TRUE)
     assert {name: float(value[0]) for name, value in metrics.items()} == pytest.approx({
         "rmse_px": np.sqrt((25 + 64) / 2), "nearest_px": 8.0, "best_px": 5.0,
-        "pck@5px": 0.5, "pck@10px": 1.0, "pck@20px": 1.0,
+        "swapped": 0.0, "pck@5px": 0.5, "pck@10px": 1.0, "pck@20px": 1.0,
     })  # fmt: skip
 
 
@@ -70,6 +76,13 @@ def test_nearest_is_of_the_most_probable_mode() -> None:
 def test_two_modes_on_one_match_leave_the_other_missed() -> None:
     errors = compute_mode_errors(np.array([[[0.0, 0.0], [0.0, 1.0]]]), TRUE)
     assert sorted(errors[0]) == pytest.approx([0.0, np.hypot(100, 1)])
+
+
+def test_swapped_are_modes_nearer_to_another_match() -> None:
+    true = np.array([[[0.0, 0.0], [100.0, 0.0]]])
+    both_left = np.array([[[2.0, 0.0], [30.0, 0.0]]])  # the second has to stand for the right match, 70 px away
+    np.testing.assert_array_equal(compute_swaps(both_left, true), [[False, True]])
+    np.testing.assert_array_equal(compute_swaps(true[:, ::-1], true), [[False, False]])
 
 
 @given(modes_and_true(), st.randoms(use_true_random=False))
@@ -115,6 +128,7 @@ def test_aggregate_by_hand() -> None:
     columns = {
         "nearest_px": [1.0, 1.0, 4.0],
         "best_px": [2.0, 0.0, 1.0],
+        "swapped": [0.0, 0.5, 1.0],
         "pck@5px": [1.0, 0.5, 0.0],
         "pck@10px": 1.0,
         "pck@20px": 1.0,
@@ -122,6 +136,6 @@ def test_aggregate_by_hand() -> None:
     summary = aggregate(pd.DataFrame({"rmse_px": [3.0, 4.0, 12.0], **columns}))
     assert summary == {
         "rmse_mean": 6.3333, "rmse_pooled": 7.5056, "median": 4.0, "nearest_mean": 2.0,
-        "best_mean": 1.0,
+        "best_mean": 1.0, "swap_rate": 0.5,
         "pck@5px": 0.5, "pck@10px": 1.0, "pck@20px": 1.0, "queries": 3,
     }  # fmt: skip

@@ -16,7 +16,7 @@ from dask.distributed import LocalCluster
 
 from mmgsd import rendering
 from mmgsd.config import RenderConfig
-from mmgsd.dataset import check_dataset
+from mmgsd.dataset import check_dataset, load_dataset
 from mmgsd.rendering import RenderError, plan_batches, render_batch, render_dataset
 
 CONFIG = RenderConfig(object="rope", train_images=3, test_images=2, views=1, samples=1, seed=5)
@@ -127,3 +127,22 @@ def test_images_of_an_older_kind_of_cloth_are_not_taken_for_todays(tiny_dataset:
     info["versions"]["scenes"] = rendering.SCENES["cloth"]
     (folder / "dataset.json").write_text(json.dumps(info))
     assert render_dataset(config, folder) == folder
+
+
+def test_an_object_without_a_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"objects/sock\.json does not exist"):
+        render_dataset(dataclasses.replace(CONFIG, object="sock"), tmp_path / "sock", progress=False)
+
+
+def test_a_changed_object_is_another_data_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MMGSD_ROOT", str(tmp_path))
+    file = tmp_path / "data" / "objects" / "sheet.json"
+    file.parent.mkdir(parents=True)
+    file.write_text('{"outline": [[0, 0], [4, 0], [4, 2], [0, 2]], "symmetry": "turns"}')
+    config, folder = RenderConfig(object="sheet", train_images=1, test_images=1, views=1), tmp_path / "sheet"
+    data = load_dataset(render_dataset(config, folder, progress=False))
+    assert (data.group().order, data.n_points) == (2, len(data.group().permutations[0]))
+    assert render_dataset(config, folder, progress=False) == folder
+    file.write_text('{"outline": [[0, 0], [4, 0], [4, 3], [0, 3]], "symmetry": "turns"}')
+    with pytest.raises(ValueError, match="scenes: .* there, .* asked for"):
+        render_dataset(config, folder, progress=False)

@@ -13,8 +13,9 @@ from scipy.ndimage import binary_erosion, distance_transform_edt
 
 bpy = pytest.importorskip("bpy")
 
-from mmgsd.config import RenderConfig  # noqa: E402
+from mmgsd.config import RenderConfig, find_root  # noqa: E402
 from mmgsd.scene import cloth, episode, randomize, render  # noqa: E402
+from mmgsd.sheet import load_sheet  # noqa: E402
 
 SIZE = (485, 485)
 
@@ -112,11 +113,11 @@ def test_a_ray_that_meets_nothing_leaves_its_point_visible():
 
 def test_crossings_count_a_flap_pushed_through_the_cloth():
     vertices = cloth.flat_vertices()
-    assert cloth.count_crossings(vertices) == 0
+    assert cloth.count_crossings(vertices, cloth.grid_faces(cloth.SIDE)) == 0
     grid = vertices.reshape(cloth.SIDE, cloth.SIDE, 3)
     grid[0, 0] = grid[10, 10] + (0.3 * cloth.SPACING, 0.3 * cloth.SPACING, -0.05)  # its neighbours stay above
     grid[0, 1, 2] = grid[1, 0, 2] = grid[1, 1, 2] = 0.05
-    assert cloth.count_crossings(vertices) > 0
+    assert cloth.count_crossings(vertices, cloth.grid_faces(cloth.SIDE)) > 0
 
 
 def test_unknown_split_and_state_are_named():
@@ -153,3 +154,37 @@ def test_a_failed_job_says_why_and_leaves_nothing(tmp_path):
     assert done.returncode == 1
     assert "did you mean 'samples'" in done.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["towel", "tshirt"])
+def test_a_sheets_points_are_its_vertices(name):
+    sheet = load_sheet(find_root() / "data" / "objects" / f"{name}.json")
+    render.reset_scene()
+    vertices, _ = cloth.deform(np.random.default_rng(4), "flat", sheet)
+    mesh = cloth._add_rendered(vertices, sheet)
+    points = render.read_vertices(mesh.data)[: len(vertices)]
+    assert len(mesh.data.vertices) > 3 * len(vertices)
+    inner = np.linalg.norm(points - vertices - [0, 0, np.mean(points[:, 2] - vertices[:, 2])], axis=1)
+    assert np.median(inner) < 0.005  # subdivision smooths, it does not move points along the sheet
+    assert inner.max() < 0.02
+
+
+def test_a_tshirt_lies_on_either_face():
+    sheet = load_sheet(find_root() / "data" / "objects" / "tshirt.json")
+    fronts = set()
+    for seed in range(6):
+        render.reset_scene()
+        vertices, _ = cloth.deform(np.random.default_rng(seed), "flat", sheet)
+        a, b, c = vertices[sheet.faces[0]]
+        fronts.add(bool(np.cross(b - a, c - a)[2] > 0))
+    assert fronts == {True, False}
+
+
+def test_views_of_a_tshirt_are_labelled():
+    sheet = load_sheet(find_root() / "data" / "objects" / "tshirt.json")
+    config = RenderConfig(object="tshirt", train_images=1, test_images=1, views=1)
+    (view,) = episode.render_episode(config, "train", 0, 1, sheet)
+    assert view.image.shape == (*sheet.size[::-1], 3)
+    assert view.xy.shape == (len(sheet.rest), 2)
+    x, y = np.rint(view.xy[view.visible]).astype(int).T
+    assert np.mean(distance_transform_edt(~view.mask)[y, x] <= 1.5) > 0.98

@@ -220,3 +220,12 @@ def test_cosine_schedule_warms_up_and_ends_at_a_hundredth() -> None:
     config = TrainConfig(steps=1000, learning_rate=1.0)
     rates = [compute_learning_rate(config, s) for s in range(1001)]
     assert (rates[0], max(rates), rates[50], rates[1000]) == pytest.approx((0.02, 1.0, 1.0, 0.01), rel=0.01)
+
+
+def test_dense_supervision_can_be_given_to_a_contrastive_loss(cloth_dataset: Path, tmp_path: Path) -> None:
+    plain = dataclasses.replace(ONE_STEP, method="spcl")
+    paths = [train(c, cloth_dataset, tmp_path / str(c.prototype_weight))
+             for c in (plain, dataclasses.replace(plain, prototype_weight=1.0))]  # fmt: skip
+    losses = [pd.read_csv(path.with_name(LOG)).loss[0] for path in paths]
+    assert losses[1] > losses[0] + 1  # ln 625 = 6.4 where nothing is known
+    assert (plain.dense_weight, ONE_STEP.dense_weight) == (0.0, 1.0)

@@ -1,8 +1,9 @@
 """Child process that renders one job: ``python -m mmgsd.scene < job.json``.
 
-The job holds ``config`` (the fields of ``RenderConfig``), ``split``, ``episodes`` as [[episode, views], …] and ``out``,
-the archive to write. Blender lives here alone: its memory goes with the process, and its chatter stays out of the
-parent's output. The exit code is 1 after an exception, its traceback on stderr.
+The job holds ``config`` (the fields of ``RenderConfig``), ``split``, ``episodes`` as [[episode, views], …], ``sheet``
+(None, or the object as `Sheet.to_dict` gives it) and ``out``, the archive to write. Blender lives here alone: its
+memory goes with the process, and its chatter stays out of the parent's output. The exit code is 1 after an exception,
+its traceback on stderr.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from typing import Any
 from PIL import Image
 
 from mmgsd.config import RenderConfig, from_dict
+from mmgsd.sheet import Sheet
 
 WEBP = {"lossless": True, "quality": 20, "method": 0}  # 25 ms an image; more effort saves a few per cent of space
 
@@ -40,13 +42,14 @@ def render_job(job: dict[str, Any]) -> Path:
     with one_core():
         from mmgsd.scene.episode import render_episode  # bpy is loaded once the output is silenced
 
+    sheet = Sheet.from_dict(job["sheet"]) if job.get("sheet") else None
     config, out = from_dict(RenderConfig, job["config"]), Path(job["out"])
     aside = out.with_name(f".{out.name}.{os.getpid()}")
     try:
         with zipfile.ZipFile(aside, "w", zipfile.ZIP_STORED) as archive:
             labels = []
             for episode, n_views in job["episodes"]:
-                for i, view in enumerate(render_episode(config, job["split"], episode, n_views)):
+                for i, view in enumerate(render_episode(config, job["split"], episode, n_views, sheet)):
                     written = write_view(archive, episode, i, view)
                     labels.append({"episode": episode, "view": i, "split": job["split"], **written})
             _add(archive, "labels.json", json.dumps(labels).encode())

@@ -1,7 +1,8 @@
-"""A square cloth, dropped, pinned, dragged, picked up and folded over by Blender's cloth physics."""
+"""A square cloth, or a sheet of another shape, dropped, pinned, dragged and folded over by cloth physics."""
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -11,11 +12,12 @@ from mathutils.bvhtree import BVHTree
 
 from mmgsd.config import RenderConfig
 from mmgsd.scene.render import DeformedObject, add_mesh, read_vertices
+from mmgsd.sheet import SPACING, Sheet
+from mmgsd.symmetry import grid_group
 
 SIDE = 37  # simulated vertices a side; with 49 a frame takes nearly twice as long
 RENDERED_SIDE = 2 * SIDE - 1  # once subdivided: every third vertex is a material point
 EXTENT = 1.0  # m
-SPACING = EXTENT / (SIDE - 1)
 VISIBILITY_RADIUS = 0.004  # m; less than the distance that self-collision keeps between two layers
 STATES = {"flat": 0.10, "wrinkled": 0.24, "folded": 0.26, "folded twice": 0.10, "corner": 0.20, "crumpled": 0.10}
 SETTLE_FRAMES = 8
@@ -43,22 +45,31 @@ def build_cloth(rng: np.random.Generator, config: RenderConfig) -> DeformedObjec
     return hand_over(vertices, {"state": state, "physics_frames": frames})
 
 
+def build_sheet(rng: np.random.Generator, sheet: Sheet) -> DeformedObject:
+    """The same with a sheet of another shape, each of whose vertices is a material point."""
+    state = str(rng.choice(list(STATES), p=list(STATES.values())))
+    vertices, frames = deform(rng, state, sheet)
+    mesh = _add_rendered(vertices, sheet)
+    points = read_vertices(mesh.data)[: len(vertices)]  # subdivision appends the new ones
+    return DeformedObject(mesh, points, VISIBILITY_RADIUS, {"state": state, "physics_frames": frames})
+
+
 def hand_over(vertices: np.ndarray, info: dict[str, str | float | int]) -> DeformedObject:
     """Add simulated vertices (1369, 3) m to the scene as a smooth cloth lying on the floor."""
-    mesh = _add_rendered(vertices)
+    mesh = _add_rendered(vertices, square_sheet())
     grid = read_vertices(mesh.data)[_order_row_major(mesh.data)]  # (73, 73, 3)
     return DeformedObject(mesh, grid[::3, ::3].reshape(-1, 3), VISIBILITY_RADIUS, info)
 
 
-def deform(rng: np.random.Generator, state: str) -> tuple[np.ndarray, int]:
-    """Simulate one state of ``STATES``: vertices (1369, 3) m, and the number of physics frames it took."""
+def deform(rng: np.random.Generator, state: str, sheet: Sheet | None = None) -> tuple[np.ndarray, int]:
+    """Simulate one state of ``STATES`` of a sheet (None: the square cloth): vertices (V, 3) m, and physics frames."""
     if state not in STATES:
         raise ValueError(f"state must be one of {', '.join(STATES)}, got {state!r}")
-    frames = 0
+    sheet, frames = sheet or square_sheet(), 0
     while True:
-        vertices = _rippled(rng, 0.001 if state == "flat" else 0.008)
+        vertices = _rippled(rng, sheet, 0.001 if state == "flat" else 0.008)
         for move in _MOVES[state]:
-            vertices, count = _perform(rng, vertices, move)
+            vertices, count = _perform(rng, sheet, vertices, move)
             frames += count
             if vertices is None:
                 break
@@ -66,31 +77,33 @@ def deform(rng: np.random.Generator, state: str) -> tuple[np.ndarray, int]:
             return vertices, frames
 
 
-def _perform(rng: np.random.Generator, start: np.ndarray, move: tuple[Plan, ...]) -> tuple[np.ndarray | None, int]:
+def _perform(
+    rng: np.random.Generator, sheet: Sheet, start: np.ndarray, move: tuple[Plan, ...]
+) -> tuple[np.ndarray | None, int]:
     """The vertices after a move, None where it failed too often, and the frames of physics that all attempts took."""
     frames = 0
     for _ in range(ATTEMPTS):
         vertices = start.copy()
         for plan in move:
             grasps, count = plan(rng, vertices)
-            vertices = _simulate(vertices, grasps, count)
+            vertices = _simulate(sheet, vertices, grasps, count)
             frames += count
-        if _is_plausible(vertices):
+        if _is_plausible(sheet, vertices):
             return vertices, frames
     return None, frames
 
 
-def _is_plausible(vertices: np.ndarray) -> bool:
+def _is_plausible(sheet: Sheet, vertices: np.ndarray) -> bool:
     """Whether the cloth came to lie, hardly stretched and hardly cutting through itself."""
-    grid = vertices.reshape(SIDE, SIDE, 3)
-    edges = np.concatenate([np.linalg.norm(np.diff(grid, axis=axis), axis=-1).ravel() for axis in (0, 1)])
-    stretched = np.quantile(edges, 0.99) > MAX_STRETCH * SPACING
-    return not stretched and np.ptp(vertices[:, 2]) < MAX_HEIGHT and count_crossings(vertices) <= MAX_CROSSINGS
+    sides = np.sort(np.stack([sheet.faces, np.roll(sheet.faces, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
+    a, b = np.unique(sides, axis=0).T
+    now, at_rest = (np.linalg.norm(points[a] - points[b], axis=-1) for points in (vertices, sheet.rest))
+    stretched, high = np.quantile(now / at_rest, 0.99) > MAX_STRETCH, np.ptp(vertices[:, 2]) >= MAX_HEIGHT
+    return not stretched and not high and count_crossings(vertices, sheet.faces) <= MAX_CROSSINGS
 
 
-def count_crossings(vertices: np.ndarray) -> int:
-    """Pairs of quads of a cloth (1369, 3) that intersect and share no vertex."""
-    faces = grid_faces(SIDE)
+def count_crossings(vertices: np.ndarray, faces: np.ndarray) -> int:
+    """Pairs of faces (F, 3 or 4) of a cloth (V, 3) that intersect and share no vertex."""
     tree = BVHTree.FromPolygons(vertices.tolist(), faces.tolist())
     a, b = np.array(tree.overlap(tree), dtype=int).reshape(-1, 2).T
     neighbours = (faces[a][:, :, None] == faces[b][:, None, :]).any(axis=(1, 2))
@@ -104,9 +117,17 @@ def flat_vertices() -> np.ndarray:
     return np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
 
 
-def _rippled(rng: np.random.Generator, height: float) -> np.ndarray:
+@functools.cache
+def square_sheet() -> Sheet:
+    """The simulated square cloth."""
+    return Sheet("cloth", flat_vertices(), grid_faces(SIDE), grid_group("c4", side=SIDE))
+
+
+def _rippled(rng: np.random.Generator, sheet: Sheet, height: float) -> np.ndarray:
     """The rest shape with long random waves of about ``height`` m: gives physics something to buckle along."""
-    vertices = flat_vertices()
+    vertices = sheet.rest.copy()
+    if sheet.either_face and rng.random() < 0.5:
+        vertices *= (1, -1, -1)
     for _ in range(6):
         wave = rng.normal(size=2) * 9.0  # rad/m
         vertices[:, 2] += height * rng.normal() * np.sin(vertices[:, :2] @ wave + rng.uniform(0, 2 * np.pi))
@@ -212,12 +233,12 @@ _MOVES: dict[str, tuple[tuple[Plan, ...], ...]] = {
 # Physics. -----------------------------------------------------------------------------------------------------------
 
 
-def _simulate(vertices: np.ndarray, grasps: list[Grasp], frames: int) -> np.ndarray:
+def _simulate(sheet: Sheet, vertices: np.ndarray, grasps: list[Grasp], frames: int) -> np.ndarray:
     """Run ``frames`` frames of cloth physics from ``vertices`` at rest; the cloth remembers its flat shape."""
     scene = bpy.context.scene
     scene.frame_start, scene.frame_end = 1, frames
     scene.frame_set(1)
-    cloth = add_mesh("cloth physics", flat_vertices(), grid_faces(SIDE))
+    cloth = add_mesh("cloth physics", sheet.rest, sheet.faces)
     floor = _add_floor()
     _set_start(cloth, vertices)
     hooks = [_add_hook(cloth, grasp) for grasp in grasps]
@@ -285,11 +306,12 @@ def grid_faces(side: int) -> np.ndarray:
     return np.stack(quads, axis=-1).reshape(-1, 4)
 
 
-def _add_rendered(vertices: np.ndarray) -> bpy.types.Object:
-    """A smooth static mesh of 73 × 73 vertices lying on z = 0."""
-    coarse = add_mesh("cloth coarse", vertices, grid_faces(SIDE))
-    rest = coarse.data.attributes.new("rest", "FLOAT_VECTOR", "POINT")  # textures in the cloth's own coordinates
-    rest.data.foreach_set("vector", (flat_vertices() / EXTENT).astype(np.float32).ravel())
+def _add_rendered(vertices: np.ndarray, sheet: Sheet) -> bpy.types.Object:
+    """A smooth static mesh lying on z = 0: of the square cloth's, 73 × 73 vertices."""
+    coarse = add_mesh("cloth coarse", vertices, sheet.faces)
+    if sheet is square_sheet():  # textures in its own coordinates; they have a square's symmetry
+        rest = coarse.data.attributes.new("rest", "FLOAT_VECTOR", "POINT")
+        rest.data.foreach_set("vector", (sheet.rest / EXTENT).astype(np.float32).ravel())
     subdivision = coarse.modifiers.new("subdivision", "SUBSURF")
     subdivision.levels = 1
     mesh = bpy.data.meshes.new_from_object(coarse.evaluated_get(bpy.context.evaluated_depsgraph_get()))

@@ -2,34 +2,45 @@
 
 from __future__ import annotations
 
+import zlib
+
 import bpy
 import numpy as np
 
 from mmgsd.config import OBJECTS, RenderConfig
 from mmgsd.scene import randomize, render
 from mmgsd.scene.render import DeformedObject, View
+from mmgsd.sheet import Sheet
 
 SPLITS = ("train", "test")
 
 
-def render_episode(config: RenderConfig, split: str, episode: int, n_views: int) -> list[View]:
-    """Create, populate, render and label ``n_views`` views of one deformation.
+def render_episode(
+    config: RenderConfig, split: str, episode: int, n_views: int, sheet: Sheet | None = None
+) -> list[View]:
+    """Create, populate, render and label ``n_views`` views of one deformation of the cloth, the rope or a ``sheet``.
 
     The same arguments give the same pixels in any process. ValueError for an unknown split.
     """
     if split not in SPLITS:
         raise ValueError(f"split must be one of {', '.join(SPLITS)}, got {split!r}")
-    rng = np.random.default_rng([config.seed, OBJECTS.index(config.object), SPLITS.index(split), episode])
+    kind = OBJECTS.index(config.object) if sheet is None else zlib.crc32(sheet.name.encode())
+    rng = np.random.default_rng([config.seed, kind, SPLITS.index(split), episode])
     scene = render.reset_scene()
-    deformed = build_object(rng, config)
+    deformed = build_object(rng, config, sheet)
     floor = add_floor()
-    render.setup_cycles(scene, config.size, config.samples)
+    size = config.size if sheet is None else sheet.size
+    render.setup_cycles(scene, size, config.samples)
     bvh = render.build_bvh(deformed.mesh)
-    return [_render_view(rng, config, scene, deformed, floor, bvh) for _ in range(n_views)]
+    return [_render_view(rng, config, size, scene, deformed, floor, bvh) for _ in range(n_views)]
 
 
-def build_object(rng: np.random.Generator, config: RenderConfig) -> DeformedObject:
+def build_object(rng: np.random.Generator, config: RenderConfig, sheet: Sheet | None = None) -> DeformedObject:
     """Add a randomly deformed object of the configured kind to the current scene."""
+    if sheet is not None:
+        from mmgsd.scene.cloth import build_sheet
+
+        return build_sheet(rng, sheet)
     if config.object == "cloth":
         from mmgsd.scene.cloth import build_cloth as build
     else:
@@ -46,12 +57,13 @@ def add_floor() -> bpy.types.Object:
 def _render_view(
     rng: np.random.Generator,
     config: RenderConfig,
+    size: tuple[int, int],
     scene: bpy.types.Scene,
     deformed: DeformedObject,
     floor: bpy.types.Object,
     bvh: render.BVHTree,
 ) -> View:
-    camera, turn = randomize.draw_camera(rng, deformed.points, config.size, config.rotation_deg)
+    camera, turn = randomize.draw_camera(rng, deformed.points, size, config.rotation_deg)
     render.place_camera(scene, camera)
     randomize.draw_light(rng, scene)
     colour, background = randomize.draw_background(rng, floor)

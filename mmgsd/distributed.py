@@ -1,0 +1,70 @@
+"""Several processes that train one model, started by ``torchrun``: each takes some groups of every step's batch.
+
+Pairs of images never reach across groups: the descriptors of another process's images, and gradients through them,
+would have to travel at each step, and a group of 16 images has 240 ordered pairs already. So the groups are part of the
+configuration, and the number of processes changes nothing but the time.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import torch
+from torch import distributed as dist
+
+
+@dataclass(frozen=True)
+class Team:
+    """The processes of a run, seen from one of them."""
+
+    device: torch.device
+    groups: tuple[int, ...]  # of each batch, that are this process's own
+    rank: int = 0
+    size: int = 1
+
+    def add(self, value: float) -> float:
+        """The sum of a number over all processes."""
+        if self.size == 1:
+            return value
+        total = torch.tensor(value, dtype=torch.float64, device=self.device)
+        dist.all_reduce(total)
+        return total.item()
+
+    def share_gradients(self, parameters: list[torch.nn.Parameter]) -> None:
+        """Sum the gradients of all processes, in one message."""
+        gradients = [p.grad for p in parameters if p.grad is not None]
+        if self.size == 1 or not gradients:
+            return
+        flat = torch.cat([g.flatten() for g in gradients])
+        dist.all_reduce(flat)
+        for gradient, summed in zip(gradients, flat.split([g.numel() for g in gradients]), strict=True):
+            gradient.copy_(summed.view_as(gradient))
+
+    def wait(self) -> None:
+        """Until all processes are here."""
+        if self.size > 1:
+            dist.barrier()
+
+
+@contextmanager
+def joined(groups: int, device: str) -> Iterator[Team]:
+    """The team that torchrun started, or this process alone; ValueError where it cannot share ``groups`` evenly."""
+    rank, size = (int(os.environ.get(name, default)) for name, default in (("RANK", 0), ("WORLD_SIZE", 1)))
+    if groups % size:
+        raise ValueError(f"groups must be a multiple of the {size} processes, got {groups}")
+    place = torch.device(device)
+    if place.type == "cuda" and size > 1:
+        place = torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)))
+        torch.cuda.set_device(place)
+    team = Team(place, tuple(range(rank, groups, size)), rank, size)
+    if size == 1:
+        yield team
+        return
+    dist.init_process_group("nccl" if place.type == "cuda" else "gloo")
+    try:
+        yield team
+    finally:
+        dist.destroy_process_group()

@@ -1,0 +1,46 @@
+"""The matrix of models: what is in it and in which order, here and on a Dask cluster."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+from dask.distributed import LocalCluster
+
+from mmgsd.config import Preset, load_preset
+from mmgsd.matrix import list_models, run_models
+
+SMOKE = load_preset("smoke")
+
+
+def test_the_main_table_comes_first() -> None:
+    models = list_models(load_preset("paper"), seeds=3)
+    assert [(m.object, m.method) for m in models[:4]] == [
+        ("cloth", "mmgsd"), ("rope", "mmgsd"), ("cloth", "spcl"), ("rope", "spcl")
+    ]  # fmt: skip
+    assert len({m.name for m in models}) == len(models)
+    assert {m.group for m in models if m.object == "cloth"} == {"c4", "v4", "d4"}
+    assert sorted({m.sigma_px for m in models}) == [1.0, 2.0, 4.0, 8.0, 16.0]
+    assert {m.seed for m in models if m.method == "mmgsd"} == {0, 1, 2}
+    assert sum(m.method == "spcl" and m.dense_weight == 1.0 for m in models) == 2
+
+
+def make_tiny(tiny_dataset: Callable[..., Path], root: Path) -> Preset:
+    for name in ("cloth", "rope"):
+        target = root / "data" / "generated" / "smoke" / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        tiny_dataset(object=name).rename(target)
+    return dataclasses.replace(SMOKE, evaluate=dataclasses.replace(SMOKE.evaluate, pairs=1, points=4))
+
+
+def test_a_cluster_gives_what_this_process_gives(tiny_dataset: Callable[..., Path], tmp_path: Path) -> None:
+    preset, root = make_tiny(tiny_dataset, tmp_path), tmp_path
+    models = [dataclasses.replace(preset.method(name, "mmgsd"), steps=1) for name in ("cloth", "rope")]
+    how = {"n_workers": 1, "threads_per_worker": 1, "processes": False, "dashboard_address": "127.0.0.1:0"}
+    with LocalCluster(**how, silence_logs="ERROR") as cluster:
+        there = dict(run_models(models, preset, root, scheduler=cluster.scheduler_address))
+    for model in models:  # made by the cluster, so taken as they are
+        assert (root / "data" / "generated" / "smoke" / "models" / model.name / "weights.safetensors").is_file()
+    assert dict(run_models(models, preset, root)) == there
+    assert set(there) == {model.name for model in models}

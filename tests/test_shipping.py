@@ -1,0 +1,32 @@
+"""Shipped weights answer as the trained ones do, and their card says where they come from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from mmgsd.config import TrainConfig
+from mmgsd.dataset import load_dataset
+from mmgsd.matching import Matcher
+from mmgsd.shipping import ship_model
+from mmgsd.training import train_model
+
+FACTS = {"preset": "smoke", "data_seed": 7, "rmse_mean": 12.34, "median": 10.0, "queries": 1234}
+
+
+def test_half_precision_gives_the_same_answers(tiny_dataset: Callable[..., Path], tmp_path: Path) -> None:
+    folder = tiny_dataset()
+    config = TrainConfig(steps=2, batch=2, pairs=2, queries=8, input_px=64)
+    weights = train_model(config, folder, tmp_path / "model", progress=False)
+    shipped = ship_model(weights, tmp_path / "shipped" / "cloth.safetensors", FACTS)
+    assert shipped.stat().st_size < 0.6 * weights.stat().st_size
+    data = load_dataset(folder, "test")
+    ours, theirs = (
+        Matcher.load(path).match(data.load_image(0), data.load_image(1), data.xy[0, :3]) for path in (weights, shipped)
+    )
+    np.testing.assert_allclose(theirs.cells, ours.cells, rtol=0.05, atol=1e-5)
+    card = shipped.with_suffix(".md").read_text()
+    for said in ("12.3 px mean", "seed 7", "`c4`", "2 steps", 'mmgsd.load("cloth")'):
+        assert said in card
