@@ -14,7 +14,7 @@ PYTHON ?= $(shell for p in python3.11 python3 python; do \
 TORCH_INDEX ?=
 # CUDA=1 installs torch with CUDA instead of the CPU build.
 CUDA ?=
-# make data-pack, data-unpack, data-sample, weights: of which preset.
+# make figures, data-pack, data-unpack, data-sample, weights: of which preset.
 PRESET ?= paper
 # make lock: the uv program, and a folder that holds torch's CPU wheel.
 UV ?= uv
@@ -31,7 +31,7 @@ PIP := env -u PYTHONDONTWRITEBYTECODE $(PY) -m pip --disable-pip-version-check i
 STAMP := .venv/.installed
 PAPERMILL := $(PY) -m papermill --kernel python3
 
-.PHONY: help .venv reproduce smoke test lint unit notebooks-test readme weights data-pack data-unpack data-sample lab lock \
+.PHONY: help .venv reproduce smoke test lint unit notebooks-test figures readme weights data-pack data-unpack data-sample lab lock \
 	clean clean-all force
 
 help: ## List the targets
@@ -58,8 +58,12 @@ notebooks-test: $(STAMP) ## Run the notebooks and compare their outputs with the
 	$(PY) -m pytest --nbval --nbval-current-env --nbval-cell-timeout=600 \
 		--nbval-sanitize-with=tests/nbval_sanitize.cfg notebooks/0*.ipynb notebooks/explore.ipynb notebooks/your_*.ipynb
 
-readme: $(STAMP) ## Put the numbers of data/results/quick into the README
-	$(PY) -m mmgsd.tables data/results/quick README.md
+figures: $(STAMP) ## Draw the paper's figures of PRESET (paper) again from data/results, without training
+	@mkdir -p data/generated
+	$(PAPERMILL) notebooks/07_figures.ipynb data/generated/figures_$(PRESET).ipynb -p preset $(PRESET)
+
+readme: $(STAMP) ## Put the numbers of data/results into the README
+	$(PY) -m mmgsd.tables data/results README.md
 
 data-pack: $(STAMP) ## Pack the data sets of PRESET (paper) into data/packs, to travel to another machine
 	$(PY) -m mmgsd.packing pack $(PRESET)

@@ -183,6 +183,14 @@ class Preset:
         """The training configuration of one method on one object."""
         return dataclasses.replace(self.train[object], method=method)
 
+    def main_table(self, object: str) -> dict[str, TrainConfig]:
+        """The models of the main table by the names they have in it.
+
+        Beside the four methods, "spcl_dense": SPCL with the dense supervision that MMGSD gets.
+        """
+        models = {method: self.method(object, method) for method in METHODS}
+        return models | {"spcl_dense": dataclasses.replace(models["spcl"], prototype_weight=1.0)}
+
 
 def _preset(
     name: str, *, views: dict, train: dict, rope: dict, ablation: dict, evaluate: dict, sigmas: tuple, **images: int

@@ -24,11 +24,13 @@ from mmgsd.config import N_POINTS
 from mmgsd.matching import Match
 
 METHOD_LABELS = {
-    "mmgsd": "MMGSD", "spcl": "SPCL", "pcl": "PCL", "unimodal": "Unimodal", "sift": "SIFT", "orb": "ORB",
+    "mmgsd": "MMGSD", "spcl": "SPCL", "pcl": "PCL", "unimodal": "Unimodal", "spcl_dense": "SPCL, dense",
+    "sift": "SIFT", "orb": "ORB",
     "surf": "SURF", "akaze": "AKAZE", "daisy": "DAISY", "centre": "Object centre", "random": "Random points",
 }  # fmt: skip
 METHOD_COLOURS = {
-    "mmgsd": "#D55E00", "spcl": "#0072B2", "pcl": "#56B4E9", "unimodal": "#009E73", "sift": "#CC79A7", "orb": "#999933",
+    "mmgsd": "#D55E00", "spcl": "#0072B2", "pcl": "#56B4E9", "unimodal": "#009E73", "spcl_dense": "#88CCEE",
+    "sift": "#CC79A7", "orb": "#999933",
     "surf": "#882255", "akaze": "#332288", "daisy": "#E69F00", "centre": "#404040", "random": "#9A9A9A",
 }  # fmt: skip
 CHANCE_STYLES = {"centre": "--", "random": ":"}

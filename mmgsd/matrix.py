@@ -17,25 +17,24 @@ from dask.distributed import Client, as_completed
 from tqdm.auto import tqdm
 
 from mmgsd.config import OBJECTS, Paths, Preset, TrainConfig, find_root, load_preset
-from mmgsd.evaluation import evaluate_model, load_queries
-from mmgsd.training import train_model
+from mmgsd.evaluation import BASELINES, CHANCE, evaluate_model, load_queries, summarise, write_results
+from mmgsd.training import WEIGHTS, describe_run, train_model
 
-PRIORITY = ("mmgsd", "spcl", "unimodal", "pcl")
+PRIORITY = ("mmgsd", "spcl", "unimodal", "pcl", "spcl_dense")
 GROUPS = ("c4", "v4", "d4")
 VALIDATIONS = 8  # RMSE on held-out simulations, in a model's log
 
 
 def list_models(preset: Preset, *, seeds: int = 1) -> list[TrainConfig]:
     """The models of the main table, SPCL with every improvement, further seeds, symmetry study and σ ablation."""
-    main = [preset.method(name, method) for method in PRIORITY for name in OBJECTS]
-    improved = [dataclasses.replace(preset.method(name, "spcl"), prototype_weight=1.0) for name in OBJECTS]
+    main = [preset.main_table(name)[method] for method in PRIORITY for name in OBJECTS]
     repeated = [
         dataclasses.replace(preset.method(name, method), seed=seed)
         for seed in range(1, seeds) for method in PRIORITY[:2] for name in OBJECTS
     ]  # fmt: skip
     groups = [dataclasses.replace(preset.ablation["cloth"], group=group) for group in GROUPS]
     sigmas = [dataclasses.replace(preset.ablation[name], sigma_px=s) for s in preset.sigmas_px for name in OBJECTS]
-    return list(dict.fromkeys([*main, *improved, *groups, *sigmas, *repeated]))
+    return list(dict.fromkeys([*main, *groups, *sigmas, *repeated]))
 
 
 def run_model(config: TrainConfig, preset: Preset, root: Path, *, progress: bool = False) -> tuple[str, float]:
@@ -62,6 +61,20 @@ def run_models(models: list[TrainConfig], preset: Preset, root: Path, *, schedul
         yield from (future.result() for future in as_completed(futures))
 
 
+def write_main_table(preset: Preset, root: Path) -> Path:
+    """Write rmse.json and runs.json of what is trained and asked so far, as `04_evaluate` does when all is."""
+    paths = Paths(root, preset.name)
+    tables, runs = {}, {}
+    for name in OBJECTS:
+        models = {m: c for m, c in preset.main_table(name).items() if paths.queries(c.name).is_file()}
+        files = {m: paths.queries(c.name) for m, c in models.items()}
+        others = {m: paths.queries(f"{name}-{m}") for m in (*BASELINES, *CHANCE)}
+        tables[name] = summarise(files | {m: path for m, path in others.items() if path.is_file()})
+        runs |= {f"{name}-{m}": describe_run(paths.model(c) / WEIGHTS) for m, c in models.items()}
+    write_results(runs, paths.results / "runs.json")
+    return write_results(tables, paths.results / "rmse.json")
+
+
 def main() -> None:
     """Run the models of a preset, a line each."""
     parser = argparse.ArgumentParser(prog="python -m mmgsd.matrix", description=__doc__.split("\n")[0])
@@ -74,6 +87,7 @@ def main() -> None:
     done = run_models(models, preset, find_root(), scheduler=asked.scheduler)
     for name, rmse in tqdm(done, total=len(models), desc="models"):
         tqdm.write(f"{name}: {rmse:.1f} px")
+        write_main_table(preset, find_root())
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The README's results table, made from the results files: ``python -m mmgsd.tables data/results/quick README.md``."""
+"""The README's tables, made from the results files: ``python -m mmgsd.tables data/results README.md``."""
 
 from __future__ import annotations
 
@@ -9,26 +9,33 @@ from pathlib import Path
 
 PAPER = {"cloth": 32.4, "rope": 31.3}  # px, MMGSD's RMSE as the paper reports it
 LABELS = {
-    "mmgsd": "**MMGSD** (ours)", "spcl": "SPCL", "unimodal": "Unimodal", "pcl": "PCL",
+    "mmgsd": "**MMGSD** (ours)", "spcl_dense": "SPCL, dense supervision", "spcl": "SPCL", "unimodal": "Unimodal",
+    "pcl": "PCL",
     "sift": "SIFT", "orb": "ORB", "akaze": "AKAZE", "daisy": "DAISY", "surf": "SURF",
     "random": "random points", "centre": "object's centre",
 }  # fmt: skip
 
 
 def make_results_table(results: dict[str, dict[str, dict[str, float]]]) -> str:
-    """Markdown from {object: {method: {metric: value}}}: RMSE, median and pck of both objects, a method a row."""
+    """Markdown from {object: {method: {metric: value}}}: RMSE, median and pck of both objects, a method a row.
+
+    A dash stands for what has not been run.
+    """
     lines = [
         "| | cloth: RMSE px | median px | pck@20px | rope: RMSE px | median px | pck@20px |",
         "|---|---|---|---|---|---|---|",
     ]
     for method, label in LABELS.items():
-        if not all(method in results[object] for object in PAPER):
-            continue  # SURF is not in every OpenCV
-        rows = [results[object][method] for object in PAPER]
-        cells = [f"{r['rmse_mean']:.1f} | {r['median']:.1f} | {100 * r['pck@20px']:.0f} %" for r in rows]
-        lines.append(f"| {label} | {' | '.join(cells)} |")
+        rows = [results[object].get(method) for object in PAPER]
+        if any(rows):  # SURF is not in every OpenCV
+            cells = [_format_errors(r) if r else "– | – | –" for r in rows]
+            lines.append(f"| {label} | {' | '.join(cells)} |")
     lines.append(f"| *the paper's MMGSD, 3,500 images each* | *{PAPER['cloth']}* | – | – | *{PAPER['rope']}* | – | – |")
     return "\n".join(lines)
+
+
+def _format_errors(row: dict[str, float]) -> str:
+    return f"{row['rmse_mean']:.1f} | {row['median']:.1f} | {100 * row['pck@20px']:.0f} %"
 
 
 def make_uncertainty_table(results: dict[str, dict[str, dict[str, dict[str, float | None]]]]) -> str:
@@ -70,7 +77,8 @@ def update_readme(readme: Path, name: str, table: str) -> None:
 if __name__ == "__main__":
     folder, target = Path(sys.argv[1]), Path(sys.argv[2])
     for part, file, make in (
-        ("results", "rmse.json", make_results_table),
-        ("uncertainty", "uncertainty.json", make_uncertainty_table),
+        ("paper", "paper/rmse.json", make_results_table),
+        ("results", "quick/rmse.json", make_results_table),
+        ("uncertainty", "quick/uncertainty.json", make_uncertainty_table),
     ):
         update_readme(target, part, make(json.loads((folder / file).read_text())))

@@ -288,6 +288,14 @@ def load_metadata(weights: Path | str) -> dict[str, str]:
         return file.metadata() or {}
 
 
+def describe_run(weights: Path | str) -> dict[str, int | float | str]:
+    """What a model cost: steps, minutes, training images, seed, hardware."""
+    note = load_metadata(weights)
+    config, minutes = json.loads(note["config"]), round(float(note["seconds"]) / 60, 2)
+    run = {"steps": config["steps"], "minutes": minutes, "images": int(note["images"])}
+    return {**run, "seed": config["seed"], "hardware": note["hardware"]}
+
+
 def _name_hardware(device: torch.device) -> str:
     if device.type == "cuda":
         return torch.cuda.get_device_name(device)

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
 from dask.distributed import LocalCluster
 
 from mmgsd.config import Preset, load_preset
-from mmgsd.matrix import list_models, run_models
+from mmgsd.matrix import list_models, run_models, write_main_table
 
 SMOKE = load_preset("smoke")
 
@@ -24,6 +26,18 @@ def test_the_main_table_comes_first() -> None:
     assert sorted({m.sigma_px for m in models}) == [1.0, 2.0, 4.0, 8.0, 16.0]
     assert {m.seed for m in models if m.method == "mmgsd"} == {0, 1, 2}
     assert sum(m.method == "spcl" and m.dense_weight == 1.0 for m in models) == 2
+
+
+def test_results_are_written_of_what_is_done(tiny_dataset: Callable[..., Path], tmp_path: Path) -> None:
+    preset = make_tiny(tiny_dataset, tmp_path)
+    cloth = dataclasses.replace(preset.train["cloth"], steps=1)
+    preset = dataclasses.replace(preset, train={**preset.train, "cloth": cloth})
+    ((name, rmse),) = run_models([preset.main_table("cloth")["spcl_dense"]], preset, tmp_path)
+    table = json.loads(write_main_table(preset, tmp_path).read_text())
+    assert table["rope"] == {}
+    assert table["cloth"]["spcl_dense"]["rmse_mean"] == pytest.approx(rmse, abs=1e-3)
+    runs = json.loads((tmp_path / "data" / "results" / "smoke" / "runs.json").read_text())
+    assert runs["cloth-spcl_dense"]["steps"] == 1
 
 
 def make_tiny(tiny_dataset: Callable[..., Path], root: Path) -> Preset:

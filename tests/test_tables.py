@@ -25,6 +25,12 @@ def test_a_method_that_was_not_at_hand_has_no_row() -> None:
     assert "SURF" not in make_results_table(results) and "SURF" in make_results_table(RESULTS)
 
 
+def test_what_was_run_on_one_object_only_has_dashes() -> None:
+    results = {**RESULTS, "rope": {}}
+    row = make_results_table(results).splitlines()[2]
+    assert row == "| **MMGSD** (ours) | 1.0 | 5.0 | 50 % | – | – | – |"
+
+
 def test_uncertainty_before_and_after() -> None:
     after = {"spearman": 0.4, "aurc": 30.0, "aurc_random": 50.0, "coverage@90%": 0.88, "ece": 0.03}
     before = after | {"coverage@90%": 0.5, "ece": 0.2, "auroc_occluded": 0.9}

@@ -1,0 +1,97 @@
+"""What the paper's figures are drawn from, small enough to be kept with the results: all errors, and one example."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pandas as pd
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
+
+from mmgsd.dataset import Dataset
+from mmgsd.matching import Match, Matcher
+from mmgsd.plots import compute_object_size
+
+STEP_PX = 1 / 8  # to which errors are rounded; kept as 16-bit integers
+QUALITY = 90  # of the example's images, JPEG
+_ANSWER = ("modes", "weights", "covariances", "entropy", "outside", "cells")
+
+
+@dataclass(frozen=True)
+class FigureData:
+    """One object's part of the paper's figures."""
+
+    errors: dict[str, pd.DataFrame]  # {method: a row a query with point, visible, rmse_px}
+    object_size_px: float  # diagonal of the bounding box, mean over the test images
+    answers: dict[str, Match]  # {method: its answers about the example}
+    true: np.ndarray  # (n, 2) px, the matches of the example's first query
+
+
+def choose_example(queries: pd.DataFrame, points: Sequence[int]) -> tuple[int, int]:
+    """The two images with the median error of ``points`` among those pairs that show most of them."""
+    groups = queries[queries.point.isin(points)].groupby("pair")
+    rows = groups.agg({"image0": "first", "image1": "first", "visible": "sum", "rmse_px": "mean"})
+    rows = rows[rows.visible == rows.visible.max()].sort_values("rmse_px")
+    row = rows.iloc[len(rows) // 2]
+    return int(row.image0), int(row.image1)
+
+
+def gather_figure_data(
+    queries: Mapping[str, pd.DataFrame], weights: Mapping[str, Path], data: Dataset, *, points: Sequence[int]
+) -> FigureData:
+    """Join all methods' ``queries`` with the trained models' answers about one example pair (`choose_example`).
+
+    ``queries`` must hold "mmgsd", which chooses the example; ``points`` are the material points asked about in it.
+    """
+    first, second = choose_example(queries["mmgsd"], points)
+    images, xy = (data.load_image(first), data.load_image(second)), data.xy[first, points]
+    answers = {method: Matcher.load(path).match(*images, xy) for method, path in weights.items()}
+    errors = {method: table[["point", "visible", "rmse_px"]] for method, table in queries.items()}
+    size = compute_object_size([data.load_mask(i) for i in range(len(data))])
+    return FigureData(errors, size, answers, data.xy[second][data.group().distinct_modes(points[0])])
+
+
+def save_figure_data(data: FigureData, path: Path) -> Path:
+    """Write a safetensors file; errors to an eighth of a pixel, all methods having answered the same queries."""
+    asked, example = next(iter(data.errors.values())), next(iter(data.answers.values()))
+    tensors = {"point": asked.point.to_numpy(np.uint16), "visible": asked.visible.to_numpy(), "true": data.true}
+    for name in ("image0", "image1"):
+        image = cv2.cvtColor(getattr(example, name), cv2.COLOR_RGB2BGR)
+        tensors[name] = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1]
+    for method, table in data.errors.items():
+        if not table[["point", "visible"]].equals(asked[["point", "visible"]]):
+            raise ValueError(f"errors[{method!r}] must answer the same queries as the other methods")
+        tensors[f"errors/{method}"] = (table.rmse_px / STEP_PX).round().clip(0, 65535).to_numpy(np.uint16)
+    tensors["xy"] = example.xy
+    for method, match in data.answers.items():
+        tensors |= {f"{method}/{name}": np.asarray(getattr(match, name), np.float32) for name in _ANSWER}
+    note = {"methods": list(data.errors), "models": list(data.answers), "object_size_px": data.object_size_px}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    aside = path.with_suffix(".tmp")
+    save_file({n: np.ascontiguousarray(t) for n, t in tensors.items()}, aside, {"figures": json.dumps(note)})
+    os.replace(aside, path)
+    return path
+
+
+def load_figure_data(path: Path) -> FigureData:
+    """Read what `save_figure_data` wrote; FileNotFoundError, or ValueError for another or a damaged file."""
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} does not exist: run notebooks/04_evaluate.ipynb for this preset")
+    try:
+        with safe_open(path, "np") as file:
+            note = json.loads(file.metadata()["figures"])
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (SafetensorError, KeyError, TypeError) as error:
+        raise ValueError(f"{path} does not hold the data of figures: {error}") from error
+    asked = pd.DataFrame({"point": tensors["point"].astype(int), "visible": tensors["visible"]})
+    errors = {m: asked.assign(rmse_px=tensors[f"errors/{m}"] * STEP_PX) for m in note["methods"]}
+    images = (cv2.cvtColor(cv2.imdecode(tensors[n], cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB) for n in ("image0", "image1"))
+    shared = dict(zip(("image0", "image1"), images, strict=True), xy=tensors["xy"])
+    answers = {m: Match(**shared, **{n: tensors[f"{m}/{n}"] for n in _ANSWER}) for m in note["models"]}
+    return FigureData(errors, note["object_size_px"], answers, tensors["true"])

@@ -1,0 +1,91 @@
+"""What the figures are drawn from: kept, read back, and chosen by rule."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from mmgsd.dataset import load_dataset
+from mmgsd.figure_data import (
+    STEP_PX,
+    FigureData,
+    choose_example,
+    gather_figure_data,
+    load_figure_data,
+    save_figure_data,
+)
+from mmgsd.matching import Match, Matcher
+
+
+def make_queries(errors: list[float], visible: list[bool]) -> pd.DataFrame:
+    """Four pairs of images asked about the points 3 and 7."""
+    pair = np.repeat(np.arange(4), 2)
+    table = {"pair": pair, "image0": pair, "image1": pair + 10, "point": np.tile([3, 7], 4)}
+    return pd.DataFrame({**table, "visible": visible, "rmse_px": errors})
+
+
+QUERIES = make_queries([1.01, 3.0, 9.0, 9.0, 5.0, 6.0, 0.0, 8000.0], [True] * 6 + [True, False])
+
+
+def answer_by_rote(self: None, image0: np.ndarray, image1: np.ndarray, xy: np.ndarray) -> Match:
+    """A match whose numbers are known, in place of a network's."""
+    count = len(xy)
+    covariances = np.tile(np.eye(2), (count, 4, 1, 1))
+    weights, nothing = np.full((count, 4), 0.25), np.zeros(count)
+    return Match(image0, image1, xy, np.ones((count, 4, 2)), weights, covariances, nothing, nothing,
+                 np.full((count, 5, 5), 0.04, np.float32))  # fmt: skip
+
+
+def test_the_example_is_the_median_of_the_pairs_that_show_the_points() -> None:
+    assert choose_example(QUERIES, [3, 7]) == (2, 12)  # means 2, 5.5 and 9; the fourth pair hides a point
+    assert choose_example(QUERIES, [3]) == (2, 12)  # 0, 1.01, 5 and 9
+
+
+@pytest.fixture
+def gathered(cloth_dataset: Path, monkeypatch: pytest.MonkeyPatch) -> FigureData:
+    """Figure data of two methods, one of them a model."""
+    monkeypatch.setattr(Matcher, "load", lambda path: Matcher.__new__(Matcher))
+    monkeypatch.setattr(Matcher, "match", answer_by_rote)
+    queries = QUERIES.assign(image0=0, image1=2)
+    tables = {"mmgsd": queries, "sift": queries.assign(rmse_px=7.3)}
+    return gather_figure_data(tables, {"mmgsd": Path("any")}, load_dataset(cloth_dataset, "test"), points=[3, 7])
+
+
+def test_gathering_asks_the_models_about_the_example(gathered: FigureData, cloth_dataset: Path) -> None:
+    data = load_dataset(cloth_dataset, "test")
+    np.testing.assert_array_equal(gathered.answers["mmgsd"].xy, data.xy[0, [3, 7]])
+    np.testing.assert_array_equal(gathered.true, data.xy[2, data.group().distinct_modes(3)])
+    assert 240 < gathered.object_size_px < 2 * 240  # of a square of 240 px, turned by any angle
+
+
+def test_kept_and_read_back(gathered: FigureData, tmp_path: Path) -> None:
+    back = load_figure_data(save_figure_data(gathered, tmp_path / "kept" / "cloth.safetensors"))
+    assert list(back.errors) == ["mmgsd", "sift"]
+    assert back.object_size_px == gathered.object_size_px
+    for method, table in back.errors.items():
+        before = gathered.errors[method]
+        assert table[["point", "visible"]].equals(before[["point", "visible"]].astype(table.dtypes[:2]))
+        np.testing.assert_allclose(table.rmse_px, before.rmse_px, atol=STEP_PX / 2)
+    before, after = gathered.answers["mmgsd"], back.answers["mmgsd"]
+    for field in dataclasses.fields(Match):
+        apart = np.abs(getattr(after, field.name).astype(float) - getattr(before, field.name))
+        assert apart.mean() < (6 if field.name.startswith("image") else 1e-6)  # JPEG
+    np.testing.assert_array_equal(back.true, gathered.true)
+
+
+def test_other_queries_are_refused(gathered: FigureData, tmp_path: Path) -> None:
+    gathered.errors["sift"] = gathered.errors["sift"].assign(point=5)
+    with pytest.raises(ValueError, match=r"errors\['sift'\] must answer the same queries"):
+        save_figure_data(gathered, tmp_path / "cloth.safetensors")
+
+
+def test_a_missing_or_damaged_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="04_evaluate"):
+        load_figure_data(tmp_path / "cloth.safetensors")
+    (tmp_path / "cloth.safetensors").write_bytes(b"0123456789")
+    with pytest.raises(ValueError, match="does not hold the data of figures"):
+        load_figure_data(tmp_path / "cloth.safetensors")
