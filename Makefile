@@ -14,7 +14,7 @@ PYTHON ?= $(shell for p in python3.11 python3 python; do \
 TORCH_INDEX ?=
 # CUDA=1 installs torch with CUDA instead of the CPU build.
 CUDA ?=
-# make figures, data-pack, data-unpack, data-sample, weights: of which preset.
+# make figures, paper, data-pack, data-unpack, data-sample, weights: of which preset.
 PRESET ?= paper
 # make lock: the uv program, and a folder that holds torch's CPU wheel.
 UV ?= uv
@@ -31,8 +31,8 @@ PIP := env -u PYTHONDONTWRITEBYTECODE $(PY) -m pip --disable-pip-version-check i
 STAMP := .venv/.installed
 PAPERMILL := $(PY) -m papermill --kernel python3
 
-.PHONY: help .venv reproduce smoke test lint unit notebooks-test figures readme weights data-pack data-unpack data-sample lab lock \
-	clean clean-all force
+.PHONY: help .venv reproduce smoke test lint unit notebooks-test figures paper readme weights data-pack data-unpack \
+	data-sample lab lock clean clean-all force
 
 help: ## List the targets
 	@grep -hE '^[.a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | awk -F'\t' '{ printf "  make %-15s %s\n", $$1, $$2 }'
@@ -76,6 +76,14 @@ data-sample: $(STAMP) ## Copy 24 images of each object of PRESET into data/sampl
 
 weights: $(STAMP) ## Put the models of PRESET into data/weights, in half precision and with a card each
 	$(PY) -m mmgsd.shipping $(PRESET)
+
+# Not committed: numbers, tables and verdicts are made anew from data/results/PRESET.
+paper: $(STAMP) ## Make the replication report paper/report.pdf from the results of PRESET; needs LaTeX
+	@command -v latexmk > /dev/null || { \
+		echo "make paper needs latexmk and LaTeX: on Debian, apt-get install latexmk texlive-latex-base texlive-latex-extra" \
+			"texlive-publishers texlive-science texlive-fonts-recommended." >&2; exit 1; }
+	$(PY) -m mmgsd.report $(PRESET)
+	cd paper && latexmk -pdf -interaction=nonstopmode -halt-on-error report.tex
 
 lab: $(STAMP) ## Open the notebooks in JupyterLab
 	$(PY) -m jupyterlab notebooks
