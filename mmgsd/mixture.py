@@ -1,8 +1,10 @@
 """n-modal Gaussian mixtures fitted to heatmaps: weighted expectation-maximisation, batched over queries.
 
-Peaks, one after another, are where it starts. A log-density is linear in (1, x, y, x², xy, y²), so an E-step is one
-matrix product with these six numbers of every cell, and an M-step, which needs their means, another. Where modes
-overlap, expectation-maximisation creeps: SQUAREM (Varadhan and Roland, Scandinavian Journal of Statistics 2008) leaps.
+Peaks, one after another, are where it starts, and flattened heatmaps are what it is fitted to first: two components that
+share a strong mode while a weak one has none would stay there (deterministic annealing, Ueda and Nakano, Neural Networks
+1998). A log-density is linear in (1, x, y, x², xy, y²), so an E-step is one matrix product with these six numbers of every
+cell, and an M-step, which needs their means, another. Where modes overlap, expectation-maximisation creeps: SQUAREM
+(Varadhan and Roland, Scandinavian Journal of Statistics 2008) leaps.
 """
 
 from __future__ import annotations
@@ -14,15 +16,16 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-CYCLES, ROUND = 60, 3  # of three EM steps and a leap, at most; a query at rest is left alone after each round
-TOLERANCE_CELLS = 0.002  # the most that a mode at rest moves in a round
+ANNEALING, ANNEALING_CYCLES = (4.0, 2.0), 6  # temperatures of the flattened heatmaps fitted first, on half the grid
+CYCLES = 60  # of three EM steps and a leap, at most; a query at rest is left alone
+TOLERANCE_CELLS = 0.0005  # the most that a mode at rest moves in a cycle
 LEAP = 16.0  # the longest leap, in steps
-KERNEL_CELLS = 2.0  # std of the kernel that finds the initial peaks
+KERNEL_CELLS = 1.0  # std of the kernel that finds the initial peaks, in cells twice as long and high
 SPREAD = (1 / 12, 10 / 12, 1 / 12)  # of a cell's mass: to second order what bilinear interpolation to pixels does
 MIN_VARIANCE = 0.05  # cells²
 PRIOR_WEIGHT = 1.0  # heatmap mass by which each component is a priori as likely as any other
 PRIOR_SHAPE = 0.2  # heatmap mass by which each component is a priori round and as wide as their average
-CHUNK = {"cpu": 2**19, "cuda": 2**26}  # numbers in the largest array of a fit: fits a core's cache, or fills a GPU
+CHUNK = {"cpu": 2**21, "cuda": 2**26}  # numbers in the largest array of a fit
 MOST_MODES, SAMPLES = 8, 200  # n="auto": the most modes tried; a heatmap weighs as much as so many drawn pixels
 ELLIPSE = 5.991  # squared Mahalanobis distance of the ellipse that holds 95 % of a Gaussian in the plane
 
@@ -71,17 +74,36 @@ def fit_modes(heatmap: Tensor, n: int | str | Tensor, xs: Tensor, ys: Tensor, *,
 
 
 def _fit(mass: Tensor, n: Tensor, n_max: int, grid: tuple[int, int], cycles: int) -> Tensor:
-    """State of the fit to (S, C) mass, in chunks of queries: memory stays bounded, and a chunk in the cache."""
-    size = max(1, CHUNK.get(mass.device.type, CHUNK["cpu"]) // (n_max * mass.shape[1]))
-    cells = _describe_cells(grid, mass.device)
-    states = []
-    for part, count in zip(mass.split(size), n.split(size), strict=True):
-        starts = [_start(part, count, n_max, grid, most) for most in (1 / count, torch.ones_like(count))]
-        starts = [_run_cycle(part, start, cells) for start in starts]
-        better = _compute_log_likelihood(part, starts[0], cells) >= _compute_log_likelihood(part, starts[1], cells)
-        state = torch.where(better[:, None, None], *starts)
-        states.append(_run_em(part, state, cells, cycles))
-    return torch.cat(states)
+    """State of the fit to (S, C) mass, in chunks of queries: memory stays bounded."""
+    coarse, coarse_grid = _halve(mass, grid)
+    size = _get_chunk(n_max, coarse)
+    starts = [_anneal(*part, n_max, coarse_grid) for part in zip(coarse.split(size), n.split(size), strict=True)]
+    state = torch.cat(starts) * mass.new_tensor([2, 2, 1, 4, 4, 4])
+    state[..., 0] += 0.5 * (grid[1] % 2)  # an odd grid was halved with a column, or a row, of nothing
+    state[..., 1] += 0.5 * (grid[0] % 2)
+    return _run_em(mass, state, _describe_cells(grid, mass.device), cycles)
+
+
+def _get_chunk(n_max: int, mass: Tensor) -> int:
+    return max(1, CHUNK.get(mass.device.type, CHUNK["cpu"]) // (n_max * mass.shape[1]))
+
+
+def _halve(mass: Tensor, grid: tuple[int, int]) -> tuple[Tensor, tuple[int, int]]:
+    """(S, C) mass on a grid of cells twice as long and high."""
+    image = F.pad(mass.view(-1, 1, *grid), (0, grid[1] % 2, 0, grid[0] % 2))
+    half = 4 * F.avg_pool2d(image, 2)[:, 0]
+    return half.flatten(1), half.shape[1:]
+
+
+def _anneal(mass: Tensor, n: Tensor, n_max: int, grid: tuple[int, int]) -> Tensor:
+    """State fitted to the flattened mass, less and less flattened."""
+    state, cells = _start(mass, n, n_max, grid), _describe_cells(grid, mass.device)
+    for temperature in ANNEALING:
+        flat = mass ** (1 / temperature)
+        flat /= flat.sum(-1, keepdim=True)
+        for _ in range(ANNEALING_CYCLES):
+            state = _run_cycle(flat, state, cells)
+    return state
 
 
 def _interpolate(mass: Tensor, grid: tuple[int, int]) -> Tensor:
@@ -95,12 +117,8 @@ def _interpolate(mass: Tensor, grid: tuple[int, int]) -> Tensor:
     return (matrices[0].T @ mass.view(-1, *grid) @ matrices[1]).flatten(1)
 
 
-def _start(mass: Tensor, n: Tensor, n_max: int, grid: tuple[int, int], most: Tensor) -> Tensor:
-    """State at n peaks found one after another, each taking up to ``most`` (S,) of all mass around it away.
-
-    All of it, and a weak mode is not hidden by what a strong one leaves; 1 / n, and modes on top of each other are
-    found as often as they are there.
-    """
+def _start(mass: Tensor, n: Tensor, n_max: int, grid: tuple[int, int]) -> Tensor:
+    """State at n peaks found one after another, each taking all mass around it away."""
     (h, w), rest = grid, mass.view(-1, *grid)
     blur_y, blur_x = (_make_kernel(count, mass.device) for count in grid)
     peaks = []
@@ -108,10 +126,8 @@ def _start(mass: Tensor, n: Tensor, n_max: int, grid: tuple[int, int], most: Ten
         local = blur_y @ (rest @ blur_x)
         # the blurred mass finds the region, the mass itself the peak inside it
         index = (local * (rest + 1e-3 * local)).flatten(1).argmax(-1)
-        share = local.flatten(1).gather(1, index[:, None])
         row, column = index // w, index % w
-        taken = (most[:, None] / share.clamp(min=1e-12)).clamp(max=1)
-        rest = rest * (1 - taken[..., None] * blur_y[row][:, :, None] * blur_x[column][:, None])
+        rest = rest * (1 - blur_y[row][:, :, None] * blur_x[column][:, None])
         peaks.append(torch.stack([column - (w - 1) / 2, row - (h - 1) / 2], -1))
     present = torch.arange(n_max, device=n.device) < n[:, None]
     variance = torch.full(present.shape, KERNEL_CELLS**2, device=n.device)
@@ -133,14 +149,18 @@ def _describe_cells(grid: tuple[int, int], device: torch.device) -> Tensor:
 
 def _run_em(mass: Tensor, state: Tensor, cells: Tensor, cycles: int) -> Tensor:
     """Iterate until at rest; then the moments of each component's share of the mass, without the priors."""
-    moving = torch.arange(len(mass), device=mass.device)
-    for _ in range(0, cycles, ROUND):
-        before = after = state[moving]
-        for _ in range(ROUND):
-            after = _run_cycle(mass[moving], after, cells)
-        state[moving] = after
-        moving = moving[(after - before)[..., :2].abs().amax((1, 2)) > TOLERANCE_CELLS]
-    present, state = state[..., 2] > 0, _compute_moments(mass, state, cells)
+    size, moving = _get_chunk(state.shape[1], mass), torch.arange(len(mass), device=mass.device)
+    for _ in range(cycles):
+        moved = []
+        for part in moving.split(size):
+            after = _run_cycle(mass[part], state[part], cells)
+            moved.append((after - state[part])[..., :2].abs().amax((1, 2)) > TOLERANCE_CELLS)
+            state[part] = after
+        moving = moving[torch.cat(moved)]
+        if not len(moving):
+            break
+    parts = zip(mass.split(size), state.split(size), strict=True)
+    present, state = state[..., 2] > 0, torch.cat([_compute_moments(*part, cells) for part in parts])
     state[..., 2] = torch.where(present, state[..., 2].clamp(min=1e-9), 0)  # 0 stays the mark of an absent one
     return state
 
@@ -179,6 +199,7 @@ def _compute_moments(mass: Tensor, state: Tensor, cells: Tensor) -> Tensor:
     count = weight[..., 0].clamp(min=1e-9)
     a, b, c = xx / count - x * x, xy / count - x * y, yy / count - y * y
     covariance = torch.stack([a.clamp(min=MIN_VARIANCE) + 1e-3, b, c.clamp(min=MIN_VARIANCE) + 1e-3], -1)
+    covariance = torch.where(weight > 1e-9, covariance, state[..., 3:])
     return torch.cat([mean, weight, covariance], -1)
 
 

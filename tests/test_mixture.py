@@ -13,6 +13,7 @@ from torch import Tensor
 from mmgsd import mixture
 from mmgsd.metrics import compute_mode_errors
 from mmgsd.mixture import fit_modes
+from mmgsd.network import compute_cell_centres
 
 
 def measure_errors(modes: np.ndarray, true: np.ndarray) -> np.ndarray:
@@ -55,6 +56,34 @@ def test_weights_are_found_and_sorted() -> None:
 def test_a_weak_mode_beside_a_strong_one_is_found() -> None:
     fit = fit_modes(draw_mixture(CORNERS, 8.0, np.array([0.2, 0.4, 0.1, 0.3])), 4, XS, YS)
     assert measure_errors(fit.modes[0], CORNERS).max() < 0.1
+
+
+def test_annealing_finds_wide_and_weak_modes_among_noise(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    heatmaps, true = [], CORNERS + rng.uniform(-40, 40, (60, 4, 2))
+    for modes in true:
+        clean = draw_mixture(modes, np.exp(rng.uniform(np.log(10), np.log(60), 4)), rng.dirichlet(np.full(4, 4.0)))
+        heatmaps.append(clean * torch.from_numpy(np.exp(rng.normal(0, 0.5, clean.shape))).float())
+
+    def measure() -> float:
+        fit = fit_modes(torch.cat(heatmaps), 4, XS, YS)
+        return np.sqrt(np.square(compute_mode_errors(fit.modes.double().numpy(), true)).mean(1)).mean()
+
+    annealed = measure()
+    monkeypatch.setattr(mixture, "ANNEALING", ())
+    assert annealed < 0.6 * measure()
+
+
+@pytest.mark.parametrize("shape", [(64, 64), (63, 64), (64, 61), (33, 47), (5, 4)])
+def test_any_grid_will_do(shape: tuple[int, int]) -> None:
+    xs, ys = compute_cell_centres((640, 480), shape)
+    true = np.array([[410.0, 130.0]])
+    x, y = np.meshgrid(xs, ys)
+    width = 2 * float(xs[1] - xs[0])
+    heatmap = torch.from_numpy(np.exp(-((x - true[0, 0]) ** 2 + (y - true[0, 1]) ** 2) / (2 * width**2)))[None]
+    moments = (heatmap[0] * torch.from_numpy(np.stack([x, y]))).sum((1, 2)) / heatmap.sum()
+    np.testing.assert_allclose(fit_modes(heatmap, 1, xs, ys).modes[0, 0], moments, atol=0.1 * float(xs[1] - xs[0]))
 
 
 def test_covariance_is_the_modes() -> None:

@@ -28,7 +28,7 @@ from mmgsd.mixture import PRIOR_SHAPE, PRIOR_WEIGHT
 from mmgsd.network import compute_cell_centres
 from mmgsd.training import WEIGHTS
 
-MODES, PLAIN, AGREE_PX = 4, 40, 0.25  # modes; queries asked the plain way
+MODES, PLAIN, AGREE_PX = 4, 100, 0.25  # modes; queries asked the plain way
 DRAWN = 10_000  # pixels drawn for each; 640,000 take 0.2 queries/s and still move the modes by 4 px
 
 
