@@ -1,10 +1,10 @@
 """n-modal Gaussian mixtures fitted to heatmaps: weighted expectation-maximisation, batched over queries.
 
-Peaks, one after another, are where it starts, and flattened heatmaps are what it is fitted to first: two components that
-share a strong mode while a weak one has none would stay there (deterministic annealing, Ueda and Nakano, Neural Networks
-1998). A log-density is linear in (1, x, y, x², xy, y²), so an E-step is one matrix product with these six numbers of every
-cell, and an M-step, which needs their means, another. Where modes overlap, expectation-maximisation creeps: SQUAREM
-(Varadhan and Roland, Scandinavian Journal of Statistics 2008) leaps.
+Peaks, one after another, are where it starts, and flattened heatmaps are what it is fitted to first: two components
+that share a strong mode while a weak one has none would stay there (deterministic annealing, Ueda and Nakano, Neural
+Networks 1998). A log-density is linear in (1, x, y, x², xy, y²), so an E-step is one matrix product with these six
+numbers of every cell, and an M-step, which needs their means, another. Where modes overlap, expectation-maximisation
+creeps: SQUAREM (Varadhan and Roland, Scandinavian Journal of Statistics 2008) leaps.
 """
 
 from __future__ import annotations
