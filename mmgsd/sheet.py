@@ -139,7 +139,7 @@ def _candidates(shape: np.ndarray, *, faces: bool) -> list[np.ndarray]:
 
 def _read_transform(entry: Any) -> np.ndarray:
     if isinstance(entry, dict) and len(entry) == 1 and set(entry) <= {"turn_deg", "over_deg"}:
-        (kind, degrees), = entry.items()
+        ((kind, degrees),) = entry.items()
         return (turn if kind == "turn_deg" else turn_over)(float(degrees))
     if isinstance(entry, list) and len(entry) == 16:
         matrix = np.array(entry, dtype=float).reshape(4, 4)[:3, :3]

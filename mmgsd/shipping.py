@@ -1,6 +1,6 @@
 """Weights that go with the repository: half precision, each with a card that says what it is.
 
-    python -m mmgsd.shipping paper      data/generated/paper/models -> data/weights/cloth.safetensors, cloth.md, …
+python -m mmgsd.shipping paper      data/generated/paper/models -> data/weights/cloth.safetensors, cloth.md, …
 """
 
 from __future__ import annotations

@@ -48,9 +48,7 @@ def train(dataset: Path, folder: Path, *, processes: int) -> tuple[np.ndarray, t
         return np.array([row["loss"] for row in json.loads(file.metadata()["numbers"])["log"]]), moments
 
 
-def test_two_processes_have_the_losses_and_gradients_of_one(
-    tiny_dataset: Callable[..., Path], tmp_path: Path
-) -> None:
+def test_two_processes_have_the_losses_and_gradients_of_one(tiny_dataset: Callable[..., Path], tmp_path: Path) -> None:
     dataset = tiny_dataset()
     (losses, moments), (losses_of_two, moments_of_two) = (
         train(dataset, tmp_path / str(n), processes=n) for n in (1, 2)

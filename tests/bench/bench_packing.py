@@ -28,8 +28,9 @@ def main() -> None:
         errors = []
         with tempfile.TemporaryDirectory() as folder:
             for data in (paths.dataset(name), unpack_dataset(archive, Path(folder) / name)):
-                table = load_queries(evaluate_model(weights, data, QUESTIONS, Path(folder) / "queries.parquet",
-                                                    progress=False))
+                table = load_queries(
+                    evaluate_model(weights, data, QUESTIONS, Path(folder) / "queries.parquet", progress=False)
+                )
                 errors.append(table.rmse_px[table.visible].to_numpy())
         rendered, packed = (float(e.mean()) for e in errors)
         apart = np.median(np.abs(errors[0] - errors[1]))
