@@ -66,6 +66,9 @@ def main() -> None:
     for name in OBJECTS:
         for method, suffix in SHIPPED.items():
             weights = paths.model(config.method(name, method)) / WEIGHTS
+            if not weights.is_file() or method not in results[name]:
+                print(f"{name} {method}: not trained and evaluated yet")
+                continue
             facts = {"preset": asked.preset, "data_seed": config.render[name].seed, **results[name][method]}
             print(ship_model(weights, paths.root / "data" / "weights" / f"{name}{suffix}.safetensors", facts))
 
