@@ -18,6 +18,7 @@ from mmgsd.drawing import MARK, METHOD_LABELS, blend_heatmap, draw_modes
 from mmgsd.matching import Match, to_rgb
 
 TRUE = "#00FF6A"  # the sign of true matches
+QUEUED_S = 0.02  # a drag's positions that come so soon after an answer had to wait for it: later ones follow
 SNAP_PX = 12.0  # a click so near to a material point shows that point's true matches
 
 
@@ -66,7 +67,7 @@ class Explorer:
         if not matchers or not scenes:
             raise ValueError("matchers and scenes must not be empty")
         self.matchers, self.scenes, self.index = dict(matchers), list(scenes), 0
-        self.xy, self.answer, self.milliseconds = None, None, 0.0
+        self.xy, self.answer, self.milliseconds, self._answered = None, None, 0.0, 0.0
         labels = [(METHOD_LABELS.get(name, name), name) for name in self.matchers]
         self.method = ipywidgets.Dropdown(options=labels, description="method")
         self.parts = {name: ipywidgets.ToggleButton(value=True, description=name, layout={"width": "8em"})
@@ -96,7 +97,10 @@ class Explorer:
             axis.set_title(title, fontsize=9)
             axis.imshow(image)
             axis.autoscale(False)
-        self.figure.canvas.draw_idle()
+        self.figure.set_layout_engine("constrained")
+        self.figure.draw_without_rendering()
+        self.figure.set_layout_engine("none")  # a third of the time to draw, and nothing moves any more
+        self._refresh()
 
     def ask(self, x: float, y: float) -> Match:
         """Answer for the pixel and draw it."""
@@ -133,7 +137,15 @@ class Explorer:
         truth = self.scene.find_truth(self.xy)
         if self.parts["true matches"].value and len(truth):
             right.scatter(*truth.T, s=55, marker="+", c=TRUE, linewidths=1.6, zorder=3)
-        self.figure.canvas.draw_idle()
+        self._refresh()
+
+    def _refresh(self) -> None:
+        """Send the picture at once, as ``draw_idle`` would only when the browser asks, but not before it is there.
+
+        ipympl draws all when a browser has opened the figure; what it is sent before that leaves it without a size.
+        """
+        if not getattr(self.figure.canvas, "syncing_data_url", False):
+            self.figure.canvas.draw()
 
     def _describe(self) -> str:
         best, answer = self.answer.best(), self.answer
@@ -145,13 +157,13 @@ class Explorer:
 
     def _build_figure(self) -> None:
         with plt.ioff():
-            self.figure, self.axes = plt.subplots(1, 2, figsize=(10, 5), layout="constrained")
+            self.figure, self.axes = plt.subplots(1, 2, figsize=(9, 4.7))
         for name in ("header_visible", "footer_visible", "toolbar_visible"):
             if hasattr(self.figure.canvas, name):  # ipympl's canvas: nothing but the pictures
                 setattr(self.figure.canvas, name, False)
 
     def _connect(self) -> None:
-        for kind in ("button_press_event", "motion_notify_event"):
+        for kind in ("button_press_event", "motion_notify_event", "button_release_event"):
             self.figure.canvas.mpl_connect(kind, self._on_mouse)
         for widget in (self.method, *self.parts.values()):
             widget.observe(self._on_change, "value")
@@ -161,8 +173,13 @@ class Explorer:
         self.steps["random"].on_click(lambda _: self.open(int(rng.integers(len(self.scenes)))))
 
     def _on_mouse(self, event: MouseEvent) -> None:
-        if event.inaxes is self.axes[0] and event.button == 1:
-            self.ask(event.xdata, event.ydata)
+        if event.inaxes is not self.axes[0] or event.button != 1:
+            return
+        waited = event.name == "motion_notify_event" and time.perf_counter() - self._answered < QUEUED_S
+        xy = [event.xdata, event.ydata]
+        if not waited and (self.xy is None or not np.array_equal(self.xy, xy)):
+            self.ask(*xy)
+            self._answered = time.perf_counter()
 
     def _on_change(self, change: dict) -> None:
         if self.xy is not None:

@@ -51,9 +51,11 @@ def open_explorer(address: str) -> Iterator[Any]:
 
     with sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        page = browser.new_page(viewport={"width": 1400, "height": 1000})
+        # tall enough for the whole notebook: JupyterLab hides the cells that are out of sight
+        page = browser.new_page(viewport={"width": 1400, "height": 1800})
         page.goto(f"{address}/tree/explore.ipynb", timeout=PATIENCE_MS)
         page.locator(".jp-Notebook .jp-CodeCell").first.wait_for(timeout=PATIENCE_MS)
+        page.get_by_text("(ipykernel) | Idle").wait_for(timeout=PATIENCE_MS)  # what is run before is lost
         page.get_by_text("Run", exact=True).first.click()
         page.get_by_text("Run All Cells", exact=True).click()
         page.locator(CANVAS).wait_for(timeout=PATIENCE_MS)
