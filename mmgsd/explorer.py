@@ -161,6 +161,8 @@ class Explorer:
         for name in ("header_visible", "footer_visible", "toolbar_visible"):
             if hasattr(self.figure.canvas, name):  # ipympl's canvas: nothing but the pictures
                 setattr(self.figure.canvas, name, False)
+        if hasattr(self.figure.canvas, "syncing_data_url"):  # the size is known before a browser asks for it
+            self.figure.canvas.manager.resize(*self.figure.bbox.size)
 
     def _connect(self) -> None:
         for kind in ("button_press_event", "motion_notify_event", "button_release_event"):
