@@ -175,7 +175,8 @@ def test_bad_arguments_are_named(change, message, image, mask, xy):
 def test_a_baseline_answers_as_a_matcher_does(method, image, mask):
     match = BaselineMatcher(method, modes=4).match(image, image, [(100, 90), (130.5, 110)], mask1=mask)
     assert (match.modes.shape, match.covariances.shape, match.heatmap.shape) == ((2, 4, 2), (2, 4, 2, 2), (2, 200, 240))
-    assert np.linalg.norm(match.modes - match.xy[:, None], axis=-1).min(1).max() < 16
+    nearest = np.linalg.norm(match.modes - match.xy[:, None], axis=-1).min(1)
+    assert nearest.max() < 24  # one and a half of the grid's cells: four modes share one peak and the noise around it
     assert match.best().xy.shape == (2, 2)
 
 
