@@ -1,5 +1,6 @@
 """The rendering stage: planned by configuration alone, resumed after a kill, never mixed with another configuration."""
 
+import contextlib
 import dataclasses
 import json
 import os
@@ -100,8 +101,9 @@ def wait_for_rendering_worker(pids: set[int]) -> int:
     deadline = time.monotonic() + 120
     while time.monotonic() < deadline:
         for pid in pids:
-            if any("mmgsd.scene" in " ".join(child.cmdline()) for child in psutil.Process(pid).children()):
-                return pid
+            with contextlib.suppress(psutil.NoSuchProcess):  # a child may end while it is looked at
+                if any("mmgsd.scene" in " ".join(child.cmdline()) for child in psutil.Process(pid).children()):
+                    return pid
         time.sleep(0.02)
     raise AssertionError("no worker began to render")
 
