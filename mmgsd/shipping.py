@@ -29,8 +29,8 @@ Descriptors of the method `{method}` for a {object}, symmetry group `{group}`; `
 | RMSE | {rmse_mean:.1f} px mean, {median:.1f} px median, {queries:,} queries with a visible source |
 | file | {megabytes:.1f} MB, safetensors, weights in half precision |
 
-Known limits: rendered images only, one object wholly in view and seen from above. Matches
-that are hidden in the image are guessed. The numbers are those of the weights before they were rounded to half precision.
+Known limits: rendered images only, one object wholly in view and seen from above. Matches that are
+hidden in the image are guessed. The numbers are those of the weights before they were rounded to half precision.
 """
 
 
