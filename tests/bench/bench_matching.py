@@ -84,28 +84,28 @@ def compute_pixels(matcher, data, descriptors, first, second, point):
 
 def fit_all_pixels(pixels, means):
     """The same mixture as ours, written plainly: every pixel, double precision, until no mode moves by 0.001 px."""
-    y, x = (a[pixels > 1e-12].astype(float) for a in np.indices(pixels.shape))
-    mass, xy = pixels[pixels > 1e-12], np.stack([x, y], -1)
-    weights, shapes = np.full(len(means), 1 / len(means)), np.stack([np.eye(2) * 900.0] * len(means))
+    pixels, means = torch.from_numpy(pixels), torch.from_numpy(means)
+    y, x = torch.nonzero(pixels > 1e-12).double().T
+    mass = pixels[pixels > 1e-12][:, None]
+    moments = torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], -1)  # (P, 6)
+    one = torch.eye(2, dtype=torch.float64)
+    weights, shapes = torch.full((len(means),), 1 / len(means)).double(), (900 * one).expand(len(means), 2, 2)
     for _ in range(3000):
-        score = []
-        for mean, weight, shape in zip(means, weights, shapes, strict=True):
-            offset = xy - mean
-            squared = np.einsum("ci,ij,cj->c", offset, np.linalg.inv(shape), offset)
-            score.append(np.log(weight) - 0.5 * np.linalg.slogdet(shape)[1] - 0.5 * squared)
-        share = np.exp(score - np.max(score, 0))
-        share *= mass / share.sum(0)
-        before, count = means, share.sum(1)
-        means = share @ xy / count[:, None]
-        own = [(s * (xy - m).T) @ (xy - m) / c for s, m, c in zip(share, means, count, strict=True)]
-        average = np.eye(2) * sum(c * np.trace(o) / 2 for c, o in zip(count, own, strict=True))
-        shapes = np.stack(
-            [(c * o + PRIOR_SHAPE * average) / (c + PRIOR_SHAPE) for c, o in zip(count, own, strict=True)]
-        )
+        inverse = torch.linalg.inv(shapes)
+        pull = torch.einsum("nij,nj->ni", inverse, means)
+        constant = weights.log() - 0.5 * shapes.logdet() - 0.5 * (pull * means).sum(-1)
+        squares = -inverse[:, 0, 0] / 2, -inverse[:, 0, 1], -inverse[:, 1, 1] / 2
+        densities = moments @ torch.stack([constant, *pull.T, *squares])  # logarithms, (P, n)
+        summed = (densities.softmax(-1) * mass).T @ moments  # (n, 6)
+        count, before = summed[:, 0], means
+        means = summed[:, 1:3] / count[:, None]
+        inner = summed[:, [3, 4, 4, 5]].view(-1, 2, 2) - count[:, None, None] * means[:, :, None] * means[:, None]
+        average = inner.diagonal(dim1=1, dim2=2).mean(-1).sum()
+        shapes = (inner + PRIOR_SHAPE * average * one) / (count + PRIOR_SHAPE)[:, None, None]
         weights = (count + PRIOR_WEIGHT) / (count + PRIOR_WEIGHT).sum()
-        if np.abs(means - before).max() < 1e-3:
+        if (means - before).abs().max() < 1e-3:
             break
-    return means
+    return means.numpy()
 
 
 def measure_argmin(data, descriptors, queries):
