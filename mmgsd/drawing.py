@@ -95,11 +95,15 @@ def draw_modes(axis: Axes, match: Match, index: int) -> None:
                                           strict=True):  # fmt: skip
         if not np.isfinite(x):
             continue
-        values, vectors = np.linalg.eigh(covariance)
-        angle = np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1]))
-        axes_px = 2 * np.sqrt(np.maximum(values[::-1], 0))
-        axis.add_patch(Ellipse((x, y), *axes_px, angle=angle, fill=False, ec="white", lw=0.7))
+        radii, angle = compute_ellipse(covariance)
+        axis.add_patch(Ellipse((x, y), *(2 * radii), angle=np.degrees(angle), fill=False, ec="white", lw=0.7))
         axis.scatter(x, y, s=4 + 40 * weight, c="none", edgecolors="#00E0FF", linewidths=0.9)
+
+
+def compute_ellipse(covariance: np.ndarray) -> tuple[np.ndarray, float]:
+    """The 1-std ellipse of a (2, 2) covariance: its radii (2,), the longer first, and that one's angle in rad."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.sqrt(np.maximum(values[::-1], 0)), np.arctan2(vectors[1, 1], vectors[0, 1])
 
 
 def mark_pixel(axis: Axes, x: float, y: float) -> None:

@@ -5,20 +5,21 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+import anywidget
+import cv2
 import ipywidgets
 import numpy as np
-from matplotlib import pyplot as plt
-from matplotlib.backend_bases import MouseEvent
+import traitlets
 
 from mmgsd.baselines import BaselineMatcher
 from mmgsd.dataset import Dataset, sample_pairs
-from mmgsd.drawing import MARK, METHOD_LABELS, blend_heatmap, draw_modes
+from mmgsd.drawing import METHOD_LABELS, blend_heatmap, compute_ellipse
 from mmgsd.matching import Match, to_rgb
 
-TRUE = "#00FF6A"  # the sign of true matches
-QUEUED_S = 0.02  # a drag's positions that come so soon after an answer had to wait for it: later ones follow
+QUALITY = 90  # of what the browser is sent, JPEG
 SNAP_PX = 12.0  # a click so near to a material point shows that point's true matches
 
 
@@ -56,8 +57,17 @@ def make_scenes(data: Dataset, *, pairs: int = 50, seed: int = 0) -> list[Callab
     return [lambda a=int(a), b=int(b): make(a, b) for a, b in chosen]
 
 
+class Pictures(anywidget.AnyWidget):
+    """The two pictures in the browser (`explorer.js`), which sends ``{"xy": [x, y]}`` and awaits an ``answered``."""
+
+    _esm = Path(__file__).with_name("explorer.js")
+    image0 = traitlets.Bytes().tag(sync=True)  # JPEG
+    image1 = traitlets.Bytes().tag(sync=True)  # JPEG
+    marks = traitlets.Dict().tag(sync=True)  # xy, modes, matches in px; set last, it has the browser draw
+
+
 class Explorer:
-    """The two pictures and their buttons; ``show()`` in a notebook with ``%matplotlib widget``.
+    """The two pictures and their buttons; ``show()`` them in a notebook.
 
     ``matchers`` {name: `Matcher` or `BaselineMatcher`}; ``scenes`` are pairs of images, or functions that load one.
     Click or drag in the left image; ``ask(x, y)`` does the same from code.
@@ -67,40 +77,32 @@ class Explorer:
         if not matchers or not scenes:
             raise ValueError("matchers and scenes must not be empty")
         self.matchers, self.scenes, self.index = dict(matchers), list(scenes), 0
-        self.xy, self.answer, self.milliseconds, self._answered = None, None, 0.0, 0.0
+        self.xy, self.answer, self.milliseconds = None, None, 0.0
         labels = [(METHOD_LABELS.get(name, name), name) for name in self.matchers]
         self.method = ipywidgets.Dropdown(options=labels, description="method")
-        self.parts = {name: ipywidgets.ToggleButton(value=True, description=name, layout={"width": "8em"})
+        self.parts = {name: ipywidgets.ToggleButton(value=True, description=name, layout={"width": "9em"})
                       for name in ("heatmap", "modes", "true matches")}  # fmt: skip
         self.steps = {name: ipywidgets.Button(description=name, layout={"width": "7em"})
                       for name in ("previous", "random", "next")}  # fmt: skip
-        self.line = ipywidgets.HTML("Click or drag in the left image.")
-        self._build_figure()
+        self.pictures, self.title, self.line = Pictures(), ipywidgets.HTML(), ipywidgets.HTML()
         self._connect()
         self.open(0)
 
     def show(self) -> ipywidgets.Widget:
         """The widget to put on the page."""
         buttons = ipywidgets.HBox([self.method, *self.parts.values(), *self.steps.values()])
-        return ipywidgets.VBox([buttons, self.figure.canvas, self.line])
+        return ipywidgets.VBox([buttons, self.title, self.pictures, self.line])
 
     def open(self, index: int) -> None:
         """Show one of the pairs."""
         self.index = index % len(self.scenes)
         scene = self.scenes[self.index]
         self.scene = scene() if callable(scene) else scene
-        self.xy, self._prepared = None, {}
-        for axis, image, title in zip(self.axes, (self.scene.image0, self.scene.image1),
-                                      (self.scene.title or "source", "matches"), strict=True):  # fmt: skip
-            axis.clear()
-            axis.set(xticks=[], yticks=[])
-            axis.set_title(title, fontsize=9)
-            axis.imshow(image)
-            axis.autoscale(False)
-        self.figure.set_layout_engine("constrained")
-        self.figure.draw_without_rendering()
-        self.figure.set_layout_engine("none")  # a third of the time to draw, and nothing moves any more
-        self._refresh()
+        self.xy, self.answer, self._prepared = None, None, {}
+        self.title.value = self.scene.title
+        self.line.value = "Click or drag in the left image."
+        self.pictures.image0 = _encode(self.scene.image0)
+        self._draw()
 
     def ask(self, x: float, y: float) -> Match:
         """Answer for the pixel and draw it."""
@@ -125,27 +127,19 @@ class Explorer:
         return self._prepared[name]
 
     def _draw(self) -> None:
-        left, right = self.axes
-        for artist in (*left.collections, *right.collections, *right.patches):
-            artist.remove()
-        left.scatter(*self.xy, s=45, facecolors=MARK, edgecolors="black", linewidths=0.9, zorder=3)
-        shown = self.parts["heatmap"].value
-        image = blend_heatmap(self.scene.image1, self.answer.heatmap[0]) if shown else self.scene.image1
-        right.images[0].set_data(image)
-        if self.parts["modes"].value:
-            draw_modes(right, self.answer, 0)
-        truth = self.scene.find_truth(self.xy)
-        if self.parts["true matches"].value and len(truth):
-            right.scatter(*truth.T, s=55, marker="+", c=TRUE, linewidths=1.6, zorder=3)
-        self._refresh()
-
-    def _refresh(self) -> None:
-        """Send the picture at once, as ``draw_idle`` would only when the browser asks, but not before it is there.
-
-        ipympl draws all when a browser has opened the figure; what it is sent before that leaves it without a size.
-        """
-        if not getattr(self.figure.canvas, "syncing_data_url", False):
-            self.figure.canvas.draw()
+        """Send the right picture and the marks in one message."""
+        image, marks = self.scene.image1, {"xy": None, "modes": [], "matches": []}
+        if self.answer is not None:
+            marks["xy"] = self.xy.tolist()
+            if self.parts["heatmap"].value:
+                image = blend_heatmap(image, self.answer.heatmap[0])
+            if self.parts["modes"].value:
+                marks["modes"] = describe_modes(self.answer)
+            if self.parts["true matches"].value:
+                marks["matches"] = self.scene.find_truth(self.xy).tolist()
+        with self.pictures.hold_sync():
+            self.pictures.image1 = _encode(image)
+            self.pictures.marks = marks
 
     def _describe(self) -> str:
         best, answer = self.answer.best(), self.answer
@@ -155,18 +149,8 @@ class Explorer:
             f"±{best.spread_px[0]:.0f} px · {self.milliseconds:.0f} ms"
         )
 
-    def _build_figure(self) -> None:
-        with plt.ioff():
-            self.figure, self.axes = plt.subplots(1, 2, figsize=(9, 4.7))
-        for name in ("header_visible", "footer_visible", "toolbar_visible"):
-            if hasattr(self.figure.canvas, name):  # ipympl's canvas: nothing but the pictures
-                setattr(self.figure.canvas, name, False)
-        if hasattr(self.figure.canvas, "syncing_data_url"):  # the size is known before a browser asks for it
-            self.figure.canvas.manager.resize(*self.figure.bbox.size)
-
     def _connect(self) -> None:
-        for kind in ("button_press_event", "motion_notify_event", "button_release_event"):
-            self.figure.canvas.mpl_connect(kind, self._on_mouse)
+        self.pictures.on_msg(self._on_message)
         for widget in (self.method, *self.parts.values()):
             widget.observe(self._on_change, "value")
         rng = np.random.default_rng()
@@ -174,18 +158,31 @@ class Explorer:
         self.steps["next"].on_click(lambda _: self.open(self.index + 1))
         self.steps["random"].on_click(lambda _: self.open(int(rng.integers(len(self.scenes)))))
 
-    def _on_mouse(self, event: MouseEvent) -> None:
-        if event.inaxes is not self.axes[0] or event.button != 1:
-            return
-        waited = event.name == "motion_notify_event" and time.perf_counter() - self._answered < QUEUED_S
-        xy = [event.xdata, event.ydata]
-        if not waited and (self.xy is None or not np.array_equal(self.xy, xy)):
-            self.ask(*xy)
-            self._answered = time.perf_counter()
+    def _on_message(self, _: Pictures, content: dict, buffers: list) -> None:
+        try:
+            self.ask(*content["xy"])
+        finally:  # the browser asks on
+            self.pictures.send({"answered": content["xy"]})
 
     def _on_change(self, change: dict) -> None:
         if self.xy is not None:
             self.ask(*self.xy)
+
+
+def describe_modes(match: Match) -> list[dict[str, Any]]:
+    """The first query's modes: ``x``, ``y`` and the 1-std ellipse's ``radii`` in px, its ``angle`` in rad, ``weight``."""
+    modes = []
+    for (x, y), weight, covariance in zip(match.modes[0], match.weights[0], match.covariances[0], strict=True):
+        if np.isfinite(x):
+            radii, angle = compute_ellipse(covariance)
+            place = {"x": float(x), "y": float(y), "weight": float(weight)}
+            modes.append({**place, "radii": radii.tolist(), "angle": float(angle)})
+    return modes
+
+
+def _encode(image: np.ndarray) -> bytes:
+    bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+    return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()
 
 
 def make_own_scene(image0: np.ndarray, image1: np.ndarray) -> Scene:

@@ -18,7 +18,7 @@ from mmgsd.config import find_root
 
 ROOT = find_root(Path(__file__).parent)
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-CANVAS = ".jupyter-matplotlib-canvas-div"
+CANVAS = ".mmgsd-explorer"
 PATIENCE_MS = 120_000
 
 

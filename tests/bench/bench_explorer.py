@@ -1,7 +1,7 @@
 """From a click to the changed picture, in a real browser: ``python tests/bench/bench_explorer.py [clicks]``.
 
 JupyterLab and a headless Chromium (which must be installed) on this machine; the clock runs in the page, from the mouse
-button to the first frame in which the figure's canvas has other pixels. The last line is the median of 30 clicks.
+button to the first frame in which the figure's right canvas has other pixels. The last line is the median of 30 clicks.
 """
 
 import sys
@@ -14,10 +14,10 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from browser import click_figure, open_explorer, run_lab
 
 WATCH = """() => {
-    const canvas = document.querySelector('.jupyter-matplotlib-canvas-div canvas');
-    const read = () => canvas.getContext('2d').getImageData(canvas.width / 2, 0, canvas.width / 2, canvas.height).data;
+    const canvas = document.querySelectorAll('.mmgsd-explorer canvas')[1];
+    const read = () => canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data;
     const differs = (a, b) => { for (let i = 0; i < a.length; i += 41) if (a[i] !== b[i]) return true; return false; };
-    window.took = new Promise(resolve => document.addEventListener('mousedown', () => {
+    window.took = new Promise(resolve => document.addEventListener('pointerdown', () => {
         const start = performance.now(), before = read();
         const look = () => differs(before, read()) ? resolve(performance.now() - start) : requestAnimationFrame(look);
         look();
