@@ -170,7 +170,7 @@ class Explorer:
 
 
 def describe_modes(match: Match) -> list[dict[str, Any]]:
-    """The first query's modes: ``x``, ``y`` and the 1-std ellipse's ``radii`` in px, its ``angle`` in rad, ``weight``."""
+    """The first query's modes: ``x``, ``y``, the 1-std ellipse's ``radii`` in px and ``angle`` in rad, ``weight``."""
     modes = []
     for (x, y), weight, covariance in zip(match.modes[0], match.weights[0], match.covariances[0], strict=True):
         if np.isfinite(x):

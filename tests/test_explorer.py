@@ -60,8 +60,10 @@ def test_modes_are_described_as_they_are(explorer: Explorer) -> None:
     answer = explorer.ask(240, 200)
     for k, mode in enumerate(explorer.pictures.marks["modes"]):
         np.testing.assert_allclose([mode["x"], mode["y"]], answer.modes[0, k])
-        turn = np.array([[np.cos(mode["angle"]), -np.sin(mode["angle"])], [np.sin(mode["angle"]), np.cos(mode["angle"])]])
-        np.testing.assert_allclose(turn @ np.diag(np.square(mode["radii"])) @ turn.T, answer.covariances[0, k], atol=0.1)
+        cos, sin = np.cos(mode["angle"]), np.sin(mode["angle"])
+        turn = np.array([[cos, -sin], [sin, cos]])
+        found = turn @ np.diag(np.square(mode["radii"])) @ turn.T
+        np.testing.assert_allclose(found, answer.covariances[0, k], atol=0.1)
 
 
 def test_the_answer_is_the_matchers(explorer: Explorer) -> None:
