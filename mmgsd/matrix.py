@@ -20,21 +20,18 @@ from mmgsd.config import OBJECTS, Paths, Preset, TrainConfig, find_root, load_pr
 from mmgsd.evaluation import BASELINES, CHANCE, evaluate_model, load_queries, summarise, write_results
 from mmgsd.training import WEIGHTS, describe_run, train_model
 
-PRIORITY = ("mmgsd", "spcl", "unimodal", "pcl", "spcl_dense")
+FIRST, LATER = ("mmgsd", "spcl"), ("unimodal", "pcl", "spcl_dense")  # of the main table: before the studies, and after
 GROUPS = ("c4", "v4", "d4")
 VALIDATIONS = 8  # RMSE on held-out simulations, in a model's log
 
 
 def list_models(preset: Preset, *, seeds: int = 1) -> list[TrainConfig]:
-    """The models of the main table, SPCL with every improvement, further seeds, symmetry study and σ ablation."""
-    main = [preset.main_table(name)[method] for method in PRIORITY for name in OBJECTS]
-    repeated = [
-        dataclasses.replace(preset.method(name, method), seed=seed)
-        for seed in range(1, seeds) for method in PRIORITY[:2] for name in OBJECTS
-    ]  # fmt: skip
+    """MMGSD and SPCL, the symmetry study, the σ ablation, the rest of the main table, and further seeds."""
+    first, later = ([preset.main_table(name)[m] for m in methods for name in OBJECTS] for methods in (FIRST, LATER))
     groups = [dataclasses.replace(preset.ablation["cloth"], group=group) for group in GROUPS]
     sigmas = [dataclasses.replace(preset.ablation[name], sigma_px=s) for s in preset.sigmas_px for name in OBJECTS]
-    return list(dict.fromkeys([*main, *groups, *sigmas, *repeated]))
+    repeated = [dataclasses.replace(config, seed=seed) for seed in range(1, seeds) for config in first]
+    return list(dict.fromkeys([*first, *groups, *sigmas, *later, *repeated]))
 
 
 def run_model(config: TrainConfig, preset: Preset, root: Path, *, progress: bool = False) -> tuple[str, float]:

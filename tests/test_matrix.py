@@ -16,11 +16,15 @@ from mmgsd.matrix import list_models, run_models, write_main_table
 SMOKE = load_preset("smoke")
 
 
-def test_the_main_table_comes_first() -> None:
+def test_the_models_that_matter_most_come_first() -> None:
     models = list_models(load_preset("paper"), seeds=3)
     assert [(m.object, m.method) for m in models[:4]] == [
         ("cloth", "mmgsd"), ("rope", "mmgsd"), ("cloth", "spcl"), ("rope", "spcl")
     ]  # fmt: skip
+    assert [m.group for m in models[4:7]] == ["c4", "v4", "d4"]  # the studies, then the rest of the main table
+    order = [m.method for m in models]
+    assert order.index("unimodal") > max(i for i, m in enumerate(models) if m.sigma_px == 16)
+    assert order[-8:] == ["mmgsd", "mmgsd", "spcl", "spcl"] * 2
     assert len({m.name for m in models}) == len(models)
     assert {m.group for m in models if m.object == "cloth"} == {"c4", "v4", "d4"}
     assert sorted({m.sigma_px for m in models}) == [1.0, 2.0, 4.0, 8.0, 16.0]
