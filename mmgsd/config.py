@@ -97,6 +97,7 @@ class TrainConfig:
     network: str = "lite0"  # or "resnet34", the contrastive papers' reference
     trunk_weights: str = ""  # safetensors file of ImageNet weights for resnet34, torchvision's names; "": random
     descriptor_dim: int = 32
+    roles: int = 1  # 2: a pixel that is asked about and one that answers have descriptors of their own
     input_px: int = 128  # the longer side of the network's input
     steps: int = 600
     batch: int = 16  # images a step
@@ -129,6 +130,7 @@ class TrainConfig:
         _check("prototype_weight", weight, "at least 0, or -1 for the method's own", weight >= 0 or weight == -1)
         for name in ("descriptor_dim", "steps", "pairs", "queries"):
             _check(name, getattr(self, name), "at least 1", getattr(self, name) >= 1)
+        _check("roles", self.roles, "1 or 2", self.roles in (1, 2))
         _check("non_matches", self.non_matches, "at least 2 (on and off the object)", self.non_matches >= 2)
         for name in ("learning_rate", "sigma_px", "sigma_start_px", "margin"):
             _check(name, getattr(self, name), "greater than 0", getattr(self, name) > 0)
@@ -231,7 +233,7 @@ PRESETS = {
     "paper": _preset(
         "paper",
         train_images=3500, test_images=500, views={"cloth": 5, "rope": 10},
-        train={"steps": 4000, "bend": 0.5}, rope={"input_px": 160},
+        train={"steps": 4000, "bend": 0.5, "roles": 2}, rope={"input_px": 160},
         ablation={"steps": 1000}, sigmas=(1.0, 2.0, 4.0, 8.0, 16.0),
         evaluate={"pairs": 500, "points": 625},
     ),

@@ -21,9 +21,10 @@ TOLERANCE = 1e-3  # of a descriptor, relative to the largest
 
 
 def export_onnx(matcher: Matcher, path: Path) -> float:
-    """Write the network as ``path``: ``image`` (B, 3, h, w) in [0, 1] of its input size, ``descriptors`` (B, D, …) out.
+    """Write the network as ``path``: ``image`` (B, 3, h, w) in [0, 1] of its input size, ``descriptors`` (B, C, …) out.
 
-    The file's metadata hold ``input_size`` ("width height", px) and the training's ``config``. What onnxruntime makes
+    C is D; or 2 D where the training's ``roles`` is 2: first those of a pixel that is asked about, then those of one
+    that answers. The file's metadata hold ``input_size`` ("width height", px) and the training's ``config``. What onnxruntime makes
     of random images is compared with torch, both in single precision: returns the largest difference, relative to the
     largest value. ValueError for another ending than .onnx, RuntimeError where they differ by more than 1e-3.
     """

@@ -147,7 +147,7 @@ class Matcher:
         if metadata.get("format") != "mmgsd-1":
             raise ValueError(f"{path} holds no mmgsd weights: its metadata says format {metadata.get('format')!r}")
         config = from_dict(TrainConfig, json.loads(metadata["config"]))
-        network = build_network(config.network, config.descriptor_dim, pretrained=False)
+        network = build_network(config.network, config.descriptor_dim, roles=config.roles, pretrained=False)
         try:
             network.load_state_dict({name: value.float() for name, value in state.items()})
         except RuntimeError as error:
@@ -158,7 +158,10 @@ class Matcher:
 
     @torch.inference_mode()
     def describe(self, images: list[np.ndarray]) -> Tensor:
-        """Descriptors (B, D, h, w) of B images (H, W, 3) uint8 of any sizes, the mean over quarter turns."""
+        """Descriptors (B, C, h, w) of B images (H, W, 3) uint8 of any sizes, the mean over quarter turns.
+
+        C is D, or 2 D where an image is described in both roles: as a source first, then as a target.
+        """
         size = compute_input_size(self.size, self.config.input_px)
         small = np.stack([cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in images])
         batch = torch.from_numpy(small).to(self.device).permute(0, 3, 1, 2).float() / 255
@@ -171,9 +174,10 @@ class Matcher:
 
     @torch.inference_mode()
     def compute_heatmaps(self, descriptors0: Tensor, descriptors1: Tensor, xy: Tensor, size: tuple[int, int]) -> Tensor:
-        """Heatmaps (S, h, w) of source px ``xy`` (S, 2) of an image of ``size``, from (D, h, w) descriptors."""
-        source = sample_descriptors(descriptors0[None], xy[None].to(self.device), size)  # (1, S, D)
-        squared = compute_squared_distances(source, descriptors1.flatten(1).T[None])[0]  # (S, C)
+        """Heatmaps (S, h, w) of source px ``xy`` (S, 2) of an image of ``size``, from what `describe` made of each."""
+        dim = self.config.descriptor_dim
+        source = sample_descriptors(descriptors0[None, :dim], xy[None].to(self.device), size)  # (1, S, D)
+        squared = compute_squared_distances(source, descriptors1[-dim:].flatten(1).T[None])[0]  # (S, h * w)
         heatmap = compute_heatmap(squared, bandwidth=self.bandwidth, temperature=self.temperature)
         return heatmap.view(len(xy), *descriptors1.shape[1:])
 
@@ -202,7 +206,7 @@ class Pair:
     matcher: Matcher
     image0: np.ndarray  # (H0, W0, 3) uint8
     image1: np.ndarray  # (H1, W1, 3) uint8
-    descriptors: Tensor  # (2, D, h, w)
+    descriptors: Tensor  # (2, C, h, w)
 
     @torch.inference_mode()
     def match(self, xy: np.ndarray | list, *, n: int | str | None = None) -> Match:

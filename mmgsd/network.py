@@ -18,12 +18,12 @@ TAPS = {2: 24, 4: 40, 10: 112, 15: 320}  # EfficientNet-Lite0: block after which
 
 
 class PyramidNetwork(nn.Module):
-    """EfficientNet-Lite0 trunk with a feature pyramid; (B, 3, H, W) in [0, 1] to (B, D, H / 4, W / 4)."""
+    """EfficientNet-Lite0 trunk with a feature pyramid; (B, 3, H, W) in [0, 1] to (B, roles * D, H / 4, W / 4)."""
 
     stride = 4
     reduced_precision = True  # bfloat16 where that is faster
 
-    def __init__(self, descriptor_dim: int, *, width: int = 96, pretrained: bool = True) -> None:
+    def __init__(self, descriptor_dim: int, *, roles: int = 1, width: int = 96, pretrained: bool = True) -> None:
         super().__init__()
         self.trunk = EfficientNet.from_name("efficientnet-lite0")
         if pretrained:
@@ -35,7 +35,7 @@ class PyramidNetwork(nn.Module):
         self.lateral = nn.ModuleList(nn.Conv2d(channels, width, 1) for channels in TAPS.values())
         self.merge = nn.ModuleList(_conv_block(width, width) for _ in TAPS)
         self.context = nn.Sequential(_conv_block(width, width), _conv_block(width, width))
-        self.head = nn.Conv2d(width, descriptor_dim, 1)
+        self.head = _make_head(width, descriptor_dim, roles)
         _register_normalisation(self)
 
     def train(self, mode: bool = True) -> PyramidNetwork:
@@ -76,6 +76,22 @@ class PyramidNetwork(nn.Module):
         return x
 
 
+class TwoRoles(nn.Module):
+    """Features to (B, 2 D, h, w): the descriptor of a pixel that is asked about, then that of one that answers.
+
+    On a fold they differ: the upper layer asks for itself alone, and answers for the hidden ones too.
+    """
+
+    def __init__(self, width: int, descriptor_dim: int) -> None:
+        super().__init__()
+        self.source = nn.Conv2d(width, descriptor_dim, 1)
+        self.target = nn.Sequential(_conv_block(width, width), nn.Conv2d(width, descriptor_dim, 1))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Source's channels first."""
+        return torch.cat([self.source(x), self.target(x)], 1)
+
+
 class ResNet34Network(nn.Module):
     """ResNet-34 with output stride 8, upsampled to the input's size (Dense Object Nets, Florence et al. 2018).
 
@@ -85,14 +101,14 @@ class ResNet34Network(nn.Module):
     stride = 1
     reduced_precision = True
 
-    def __init__(self, descriptor_dim: int) -> None:
+    def __init__(self, descriptor_dim: int, *, roles: int = 1) -> None:
         super().__init__()
         self.trunk = ResNet34Trunk()
-        self.head = nn.Conv2d(512, descriptor_dim, 1)
+        self.head = _make_head(512, descriptor_dim, roles)
         _register_normalisation(self)
 
     def forward(self, image: Tensor) -> Tensor:
-        """(B, 3, H, W) in [0, 1] to (B, D, H, W)."""
+        """(B, 3, H, W) in [0, 1] to (B, roles * D, H, W)."""
         with torch.autocast(image.device.type, torch.bfloat16, enabled=self.reduced_precision):
             x = self.trunk((image - self.mean) / self.std)  # (B, 512, H / 8, W / 8)
         return F.interpolate(self.head(x.float()), image.shape[-2:], mode="bilinear", align_corners=False)
@@ -154,16 +170,16 @@ class BasicBlock(nn.Module):
 
 
 def build_network(
-    name: str, descriptor_dim: int, *, pretrained: bool = True, trunk_weights: Path | str = ""
+    name: str, descriptor_dim: int, *, roles: int = 1, pretrained: bool = True, trunk_weights: Path | str = ""
 ) -> PyramidNetwork | ResNet34Network:
-    """The network ``lite0`` or ``resnet34``; ValueError for another name.
+    """The network ``lite0`` or ``resnet34`` with D channels for each of 1 or 2 roles; ValueError for another name.
 
     ``pretrained`` starts lite0 from ImageNet, resnet34 does from the file ``trunk_weights`` where one is given.
     """
     if name == "lite0":
-        return PyramidNetwork(descriptor_dim, pretrained=pretrained)
+        return PyramidNetwork(descriptor_dim, roles=roles, pretrained=pretrained)
     if name == "resnet34":
-        network = ResNet34Network(descriptor_dim)
+        network = ResNet34Network(descriptor_dim, roles=roles)
         if pretrained and trunk_weights:
             network.load_trunk(trunk_weights)
         return network
@@ -203,6 +219,10 @@ def _conv_block(inputs: int, outputs: int) -> nn.Sequential:
     return nn.Sequential(
         nn.Conv2d(inputs, outputs, 3, padding=1, bias=False), nn.BatchNorm2d(outputs), nn.ReLU(inplace=True)
     )
+
+
+def _make_head(width: int, descriptor_dim: int, roles: int) -> nn.Module:
+    return nn.Conv2d(width, descriptor_dim, 1) if roles == 1 else TwoRoles(width, descriptor_dim)
 
 
 def _register_normalisation(module: nn.Module) -> None:

@@ -99,8 +99,8 @@ def compute_loss(
 ) -> Tensor:  # fmt: skip
     """The configured method's loss of a group of a batch: every image is a source and a target of others in it.
 
-    ``descriptors`` (B, D, h, w), ``permutations`` (G, P) of the matches the method knows. Randomness comes from seed,
-    step and the group's number.
+    ``descriptors`` (B, C, h, w), a source's D first, a target's last; ``permutations`` (G, P) of the matches the method
+    knows. Randomness comes from seed, step and the group's number.
     """
     seed = (config.seed * 1_000_003 + step) * config.groups + group
     generator = torch.Generator(descriptors.device).manual_seed(seed)
@@ -108,20 +108,22 @@ def compute_loss(
     pair = _sample_batch_pairs(len(descriptors), pairs, generator, descriptors.device)  # (2, K)
     points = torch.multinomial(batch.askable[pair[0]].float() + 1e-9, config.queries, True, generator=generator)
     orbit = permutations[:, points].permute(1, 2, 0)  # (K, Q, G)
-    sampled = sample_descriptors(descriptors, batch.xy, size)  # (B, P, D)
-    source = sampled[pair[0][:, None], points]  # (K, Q, D)
+    target = descriptors[:, -config.descriptor_dim :]  # (B, D, h, w)
+    sampled = sample_descriptors(descriptors, batch.xy, size)  # (B, P, C)
+    source = sampled[pair[0][:, None], points, : config.descriptor_dim]  # (K, Q, D)
     modes = batch.xy[pair[1][:, None, None], orbit]  # (K, Q, G, 2)
     valid = batch.inside[pair[1][:, None, None], orbit] & batch.askable[pair[0][:, None], points][..., None]
     xs, ys = (c.to(descriptors.device) for c in compute_cell_centres(size, descriptors.shape[-2:]))
     if config.method in CONTRASTIVE:
         valid = valid & batch.askable[pair[1][:, None, None], orbit]  # as in Dense Object Nets: seen in both images
-        match = (source[:, :, None] - sampled[pair[1][:, None, None], orbit]).square().sum(-1)
-        far, apart = _sample_non_matches(config, descriptors, batch, pair, source, modes, (xs, ys), generator)
+        there = sampled[pair[1][:, None, None], orbit, -config.descriptor_dim :]  # (K, Q, G, D)
+        match = (source[:, :, None] - there).square().sum(-1)
+        far, apart = _sample_non_matches(config, target, batch, pair, source, modes, (xs, ys), generator)
         function = losses.pcl if config.method == "pcl" else losses.spcl
         return function((match + 1e-12).sqrt(), valid, (far + 1e-12).sqrt(), apart, margin=config.margin)
-    target = losses.compute_target(modes, valid, xs, ys, compute_sigma(config, step))
-    squared = losses.compute_squared_distances(source, descriptors[pair[1]].flatten(2).mT)
-    return losses.mmgsd(squared, target)
+    wanted = losses.compute_target(modes, valid, xs, ys, compute_sigma(config, step))
+    squared = losses.compute_squared_distances(source, target[pair[1]].flatten(2).mT)
+    return losses.mmgsd(squared, wanted)
 
 
 class _Run:
@@ -139,8 +141,10 @@ class _Run:
         self.permutations = torch.tensor(known, device=device)
         self.images = load_training_images(self.data, config.input_px)
         torch.manual_seed(config.seed)
-        network = build_network(config.network, config.descriptor_dim, trunk_weights=config.trunk_weights).to(device)
-        self.network = network.to(memory_format=torch.channels_last)
+        network = build_network(
+            config.network, config.descriptor_dim, roles=config.roles, trunk_weights=config.trunk_weights
+        )
+        self.network = network.to(device, memory_format=torch.channels_last)
         # the average of the last steps' weights, statistics of batch normalisation included, is what is kept
         average = get_ema_multi_avg_fn(1 - 1 / max(2.0, config.steps / 50))
         self.average = AveragedModel(self.network, multi_avg_fn=average, use_buffers=True)
@@ -195,7 +199,7 @@ class _Run:
         """The prototypes' loss, on a part of the material points in turn."""
         turn = torch.arange(batch.askable.shape[1], device=self.device) % PROTOTYPE_EVERY
         asked = batch.askable & (turn == self.step % PROTOTYPE_EVERY)
-        sampled = sample_descriptors(descriptors, batch.xy, self.size)
+        sampled = sample_descriptors(descriptors[:, : self.config.descriptor_dim], batch.xy, self.size)
         return compute_prototype_loss(sampled, asked, self.prototypes, self.permutations)
 
     def make_matcher(self) -> Matcher:
@@ -314,11 +318,11 @@ def _sample_batch_pairs(images: int, pairs: int, generator: torch.Generator, dev
 
 
 def _sample_non_matches(
-    config: TrainConfig, descriptors: Tensor, batch: Batch, pair: Tensor, source: Tensor, modes: Tensor,
+    config: TrainConfig, target: Tensor, batch: Batch, pair: Tensor, source: Tensor, modes: Tensor,
     cells: tuple[Tensor, Tensor], generator: torch.Generator,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Squared distances (K, Q, N) to random cells, half on the object and half off it, and which are no match."""
-    (k, q, _), (height, width) = source.shape, descriptors.shape[-2:]
+    (k, q, _), (height, width) = source.shape, target.shape[-2:]
     on_object = F.adaptive_avg_pool2d(batch.mask.float()[:, None], (height, width))[pair[1], 0].flatten(1)  # (K, C)
     half = config.non_matches // 2
     drawn = [
@@ -326,7 +330,7 @@ def _sample_non_matches(
         for weight, count in ((on_object, half), (1 - on_object, config.non_matches - half))
     ]
     cell = torch.cat(drawn, -1)  # (K, Q, N)
-    flat = descriptors[pair[1]].flatten(2).mT  # (K, C, D)
+    flat = target[pair[1]].flatten(2).mT  # (K, C, D)
     picked = flat[torch.arange(k, device=cell.device)[:, None, None], cell]  # (K, Q, N, D)
     xs, ys = cells
     position = torch.stack([xs[cell % width], ys[cell // width]], -1)  # (K, Q, N, 2)

@@ -64,6 +64,17 @@ def image(rng: np.random.Generator) -> np.ndarray:
     return rng.integers(0, 256, (120, 160, 3), dtype=np.uint8)
 
 
+def test_the_first_image_asks_and_the_second_answers() -> None:
+    config = dataclasses.replace(CONFIG, roles=2, descriptor_dim=2)
+    network = build_network("lite0", 2, roles=2, pretrained=False)
+    matcher = Matcher(network, config, modes=1, size=(64, 64), device="cpu")
+    asking, answering = torch.zeros(2, 4, 8, 8)
+    asking[:2] = 3.0
+    answering[2:, 5, 6] = 3.0  # the one cell that is a good target
+    heatmap = matcher.compute_heatmaps(asking, answering, torch.tensor([[30.0, 30.0]]), (64, 64))[0]
+    assert divmod(int(heatmap.argmax()), 8) == (5, 6) and heatmap.max() > 0.99
+
+
 def save_weights(path: Path, network: torch.nn.Module, **metadata: str) -> Path:
     stored = {"format": "mmgsd-1", "config": json.dumps(dataclasses.asdict(CONFIG)), "modes": "4", "size": "[485, 485]"}
     save_file({k: v.contiguous() for k, v in network.state_dict().items()}, path, stored | metadata)

@@ -161,14 +161,17 @@ def test_the_rope_trains(tiny_dataset: Callable[..., Path], tmp_path: Path) -> N
         assert (file.metadata()["modes"], file.metadata()["size"]) == ("2", "[640, 480]")
 
 
-def test_learns_a_single_batch() -> None:
+@pytest.mark.parametrize("roles", [1, 2])
+def test_learns_a_single_batch(roles: int) -> None:
     """Descriptors that are free parameters come two nats closer than a uniform guess, ln 256."""
-    config = dataclasses.replace(TINY, sigma_px=16.0, sigma_start_px=16.0, augment=False)
+    config = dataclasses.replace(TINY, roles=roles, sigma_px=16.0, sigma_start_px=16.0, augment=False)
     xy = torch.tensor([[[60.0, 60], [420, 60], [420, 420], [60, 420]]] * 2)
     seen = torch.ones(2, 4, dtype=torch.bool)
     batch = training.Batch(torch.zeros(2, 3, 64, 64), torch.ones(2, 64, 64, dtype=torch.bool), xy, seen, seen)
     permutations = torch.tensor([[0, 1, 2, 3], [1, 2, 3, 0], [2, 3, 0, 1], [3, 0, 1, 2]])
-    descriptors = torch.nn.Parameter(0.1 * torch.randn(2, 8, 16, 16, generator=torch.Generator().manual_seed(0)))
+    descriptors = torch.nn.Parameter(
+        0.1 * torch.randn(2, 8 * roles, 16, 16, generator=torch.Generator().manual_seed(0))
+    )
     optimiser, values = torch.optim.Adam([descriptors], lr=0.1), []
     for _ in range(100):
         values.append(compute_loss(config, descriptors, batch, permutations, (485, 485), 0))
@@ -176,6 +179,21 @@ def test_learns_a_single_batch() -> None:
         values[-1].backward()
         optimiser.step()
     assert values[-1] < values[0] - 2
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_roles_with_equal_descriptors_are_one_role(cloth_dataset: Path, method: str, rng: np.random.Generator) -> None:
+    config = dataclasses.replace(TINY, method=method)
+    data = load_dataset(cloth_dataset)
+    batch = make_batch(load_training_images(data, 64), np.arange(4), config, rng, torch.device("cpu"))
+    permutations = torch.tensor(data.group("c4").permutations)
+    one = torch.randn(4, 8, 16, 16, generator=torch.Generator().manual_seed(0))
+    two = torch.cat([one, one], 1).requires_grad_()
+    losses = [compute_loss(dataclasses.replace(config, roles=roles), descriptors, batch, permutations, data.size, 0)
+              for roles, descriptors in ((1, one), (2, two))]  # fmt: skip
+    torch.testing.assert_close(losses[0], losses[1])
+    losses[1].backward()
+    assert two.grad[:, :8].any() and two.grad[:, 8:].any()
 
 
 def test_hidden_points_are_not_asked(tiny_dataset: Callable[..., Path], rng: np.random.Generator) -> None:
