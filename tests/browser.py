@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import socket
 import subprocess
@@ -14,6 +15,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import nbformat
+
 from mmgsd.config import find_root
 
 ROOT = find_root(Path(__file__).parent)
@@ -24,14 +27,22 @@ PATIENCE_MS = 120_000
 
 @contextmanager
 def run_lab(folder: Path) -> Iterator[str]:
-    """Address of a JupyterLab that serves ``folder`` with a copy of the explorer's notebook, on loopback."""
-    shutil.copy(ROOT / "notebooks" / "explore.ipynb", folder)
+    """Address of a JupyterLab that serves ``folder`` with the explorer's notebook, not yet run, on loopback."""
+    notebook = nbformat.read(ROOT / "notebooks" / "explore.ipynb", as_version=4)
+    for cell in notebook.cells:
+        if cell.cell_type == "code":
+            cell.update(outputs=[], execution_count=None)
+    nbformat.write(notebook, folder / "explore.ipynb")
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     options = ["--no-browser", "--allow-root", "--ServerApp.ip=127.0.0.1", f"--ServerApp.port={port}",
                f"--ServerApp.root_dir={folder}", "--IdentityProvider.token="]  # fmt: skip
     places = {f"JUPYTER_{kind}_DIR": str(folder / kind) for kind in ("CONFIG", "RUNTIME", "DATA")}
+    # show every cell, also those out of sight
+    settings = folder / "CONFIG" / "lab" / "user-settings" / "@jupyterlab" / "notebook-extension"
+    settings.mkdir(parents=True)
+    (settings / "tracker.jupyterlab-settings").write_text('{"windowingMode": "none"}')
     env = {**os.environ, **places, "MMGSD_ROOT": str(ROOT), "PYTHONPATH": str(ROOT)}
     with (folder / "lab.log").open("w") as log:
         server = subprocess.Popen([sys.executable, "-m", "jupyterlab", *options], env=env, stdout=log, stderr=log)
@@ -47,21 +58,40 @@ def run_lab(folder: Path) -> Iterator[str]:
 @contextmanager
 def open_explorer(address: str) -> Iterator[Any]:
     """A page (playwright) with the notebook run to its end, the explorer showing an answer."""
-    from playwright.sync_api import sync_playwright
+    from playwright.sync_api import Error, sync_playwright
 
     with sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        # tall enough for the whole notebook: JupyterLab hides the cells that are out of sight
-        page = browser.new_page(viewport={"width": 1400, "height": 1800})
-        page.goto(f"{address}/tree/explore.ipynb", timeout=PATIENCE_MS)
-        page.locator(".jp-Notebook .jp-CodeCell").first.wait_for(timeout=PATIENCE_MS)
-        page.get_by_text("(ipykernel) | Idle").wait_for(timeout=PATIENCE_MS)  # what is run before is lost
-        page.get_by_text("Run", exact=True).first.click()
-        page.get_by_text("Run All Cells", exact=True).click()
-        page.locator(CANVAS).wait_for(timeout=PATIENCE_MS)
-        page.get_by_text("nats").wait_for(timeout=PATIENCE_MS)  # the last cell asks about a pixel
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-dev-shm-usage"])
+        page = browser.new_page(viewport={"width": 1400, "height": 1800})  # tall enough for the whole notebook
+        console: list[str] = []
+        page.on("console", lambda message: console.append(f"{message.type}: {message.text}"))
+        page.on("pageerror", lambda error: console.append(f"uncaught: {error}"))
+        try:
+            page.goto(f"{address}/tree/explore.ipynb", timeout=PATIENCE_MS)
+            page.locator(".jp-Notebook .jp-CodeCell").first.wait_for(timeout=PATIENCE_MS)
+            page.get_by_text("(ipykernel) | Idle").wait_for(timeout=PATIENCE_MS)  # what is run before is lost
+            _run_all(page)
+            page.locator(CANVAS).wait_for(timeout=PATIENCE_MS)
+            page.get_by_text("nats").wait_for(timeout=PATIENCE_MS)  # the last cell asks about a pixel
+        except Error as error:
+            shown = page.locator("body").inner_text()[-4000:]
+            raise AssertionError(f"{error}\nthe page: {shown}\nits console: {console[-20:]}") from error
         yield page
         browser.close()
+
+
+def _run_all(page: Any) -> None:
+    """Run all cells; once more where the kernel was not ready and nothing began."""
+    from playwright.sync_api import TimeoutError
+
+    for _ in range(5):
+        page.get_by_text("Run", exact=True).first.click()
+        page.get_by_text("Run All Cells", exact=True).click()
+        try:
+            page.locator(".jp-InputPrompt", has_text=re.compile(r"\[[*\d]+\]")).first.wait_for(timeout=PATIENCE_MS / 10)
+            return
+        except TimeoutError:
+            continue
 
 
 def click_figure(page: Any, x: float, y: float) -> None:
