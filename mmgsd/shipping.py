@@ -11,8 +11,7 @@ import os
 from pathlib import Path
 
 import torch
-from safetensors import safe_open
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 
 from mmgsd.config import OBJECTS, Paths, find_root, load_preset
 from mmgsd.training import WEIGHTS, load_metadata
@@ -37,15 +36,16 @@ hidden in the image are guessed. The numbers are those of the weights before the
 def ship_model(weights: Path, out: Path, facts: dict) -> Path:
     """Write ``weights`` in half precision to ``out``, the card beside it; vectors (normalisation) stay as they are.
 
+    A file that says the same already is left alone: the order of a safetensors header's entries is not kept.
     ``facts``: ``preset``, ``data_seed`` and the results ``rmse_mean``, ``median``, ``queries``.
     """
-    with safe_open(weights, "pt") as file:
-        state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    state = {name: value.half() if value.ndim > 1 else value for name, value in state.items()}
-    out.parent.mkdir(parents=True, exist_ok=True)
-    aside, note = out.with_suffix(".tmp"), load_metadata(weights)
-    save_file(state, aside, note)
-    os.replace(aside, out)
+    state = {name: value.half() if value.ndim > 1 else value for name, value in load_file(weights).items()}
+    note = load_metadata(weights)
+    if not out.is_file() or not _holds(out, state, note):
+        out.parent.mkdir(parents=True, exist_ok=True)
+        aside = out.with_suffix(".tmp")
+        save_file(state, aside, note)
+        os.replace(aside, out)
     width, height = json.loads(note["size"])
     described = {
         **json.loads(note["config"]), **note, **facts, "name": out.stem, "width": width, "height": height,
@@ -54,6 +54,15 @@ def ship_model(weights: Path, out: Path, facts: dict) -> Path:
     }  # fmt: skip
     out.with_suffix(".md").write_text(CARD.format(**described))
     return out
+
+
+def _holds(file: Path, state: dict[str, torch.Tensor], note: dict[str, str]) -> bool:
+    held = load_file(file)
+    return (
+        held.keys() == state.keys()
+        and load_metadata(file) == note
+        and all(torch.equal(held[name], value) for name, value in state.items())
+    )
 
 
 def main() -> None:

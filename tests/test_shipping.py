@@ -30,3 +30,5 @@ def test_half_precision_gives_the_same_answers(tiny_dataset: Callable[..., Path]
     card = shipped.with_suffix(".md").read_text()
     for said in ("12.3 px mean", "seed 7", "`c4`", "2 steps", 'mmgsd.load("cloth")'):
         assert said in card
+    again = shipped.stat().st_mtime_ns
+    assert ship_model(weights, shipped, FACTS).stat().st_mtime_ns == again
