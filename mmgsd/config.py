@@ -95,7 +95,9 @@ class TrainConfig:
     method: str = "mmgsd"
     group: str = ""  # symmetry group the matches come from; "" is the object's own (c4, c2, or its file's)
     network: str = "lite0"  # or "resnet34", the contrastive papers' reference
-    trunk_weights: str = ""  # safetensors file of ImageNet weights for resnet34, torchvision's names; "": random
+    # what to start from: for lite0 "cloth", "rope" or a file trained here with the same network ("": ImageNet); for
+    # resnet34 a safetensors file of ImageNet weights with torchvision's names ("": random)
+    trunk_weights: str = ""
     descriptor_dim: int = 32
     roles: int = 1  # 2: a pixel that is asked about and one that answers have descriptors of their own
     input_px: int = 128  # the longer side of the network's input
@@ -123,8 +125,6 @@ class TrainConfig:
         _check_choice("method", self.method, METHODS)
         _check_choice("network", self.network, ("lite0", "resnet34"))
         _check_choice("schedule", self.schedule, ("cosine", "step"))
-        accepted = "'' for lite0, which brings its own"
-        _check("trunk_weights", self.trunk_weights, accepted, not self.trunk_weights or self.network == "resnet34")
         _set_frozen(self, "group", self.group or DEFAULT_GROUP.get(self.object, OWN_GROUP))
         weight = self.prototype_weight
         _check("prototype_weight", weight, "at least 0, or -1 for the method's own", weight >= 0 or weight == -1)

@@ -174,7 +174,7 @@ def build_network(
 ) -> PyramidNetwork | ResNet34Network:
     """The network ``lite0`` or ``resnet34`` with D channels for each of 1 or 2 roles; ValueError for another name.
 
-    ``pretrained`` starts lite0 from ImageNet, resnet34 does from the file ``trunk_weights`` where one is given.
+    ``pretrained`` starts lite0 from ImageNet; resnet34 does from the file ``trunk_weights`` where one is given.
     """
     if name == "lite0":
         return PyramidNetwork(descriptor_dim, roles=roles, pretrained=pretrained)

@@ -26,7 +26,7 @@ from mmgsd.config import TrainConfig
 from mmgsd.dataset import Dataset, hold_out, load_dataset
 from mmgsd.evaluation import calibrate_bandwidth, calibrate_temperature, measure_rmse
 from mmgsd.losses import CONTRASTIVE, MATCHES_OF_ONE
-from mmgsd.matching import Matcher
+from mmgsd.matching import Matcher, load
 from mmgsd.network import (
     build_network,
     compute_cell_centres,
@@ -68,7 +68,8 @@ def train_model(
     and the first one writes the files. The losses and gradients are those of a single process.
 
     A finished model is returned as it is, a killed run goes on from its last checkpoint and ends with the same weights.
-    Raises ValueError where the data set is of another object or does not store the symmetry group.
+    Raises ValueError where the data set is of another object or does not store the symmetry group, and where
+    ``config.trunk_weights`` are of another network; FileNotFoundError where there are none.
     """
     weights = folder / WEIGHTS
     data = load_dataset(dataset, "train")
@@ -76,12 +77,13 @@ def train_model(
         if load_metadata(weights).get("data") != data.fingerprint:
             raise ValueError(f"{weights} was trained on another data set than {dataset}: use overwrite=True")
         return weights
-    if overwrite and folder.exists():
-        shutil.rmtree(folder)
     if data.object != config.object:
         raise ValueError(f"object is {config.object!r}, but {dataset} shows a {data.object}")
     with distributed.joined(config.groups, device or find_device()) as team:
-        run = _Run(config, data, folder, team, validate_every)
+        run = _Run(config, data, folder, team, validate_every)  # what is wrong is said before anything is deleted
+        if overwrite and team.rank == 0 and folder.exists():
+            shutil.rmtree(folder)
+        team.wait()
         run.resume()
         shown = progress and team.rank == 0
         bar = tqdm(range(run.step, config.steps), desc=config.name, disable=not shown, leave=False)
@@ -141,10 +143,7 @@ class _Run:
         self.permutations = torch.tensor(known, device=device)
         self.images = load_training_images(self.data, config.input_px)
         torch.manual_seed(config.seed)
-        network = build_network(
-            config.network, config.descriptor_dim, roles=config.roles, trunk_weights=config.trunk_weights
-        )
-        self.network = network.to(device, memory_format=torch.channels_last)
+        self.network = _make_network(config).to(device, memory_format=torch.channels_last)
         # the average of the last steps' weights, statistics of batch normalisation included, is what is kept
         average = get_ema_multi_avg_fn(1 - 1 / max(2.0, config.steps / 50))
         self.average = AveragedModel(self.network, multi_avg_fn=average, use_buffers=True)
@@ -298,6 +297,22 @@ def describe_run(weights: Path | str) -> dict[str, int | float | str]:
     config, minutes = json.loads(note["config"]), round(float(note["seconds"]) / 60, 2)
     run = {"steps": config["steps"], "minutes": minutes, "images": int(note["images"])}
     return {**run, "seed": config["seed"], "hardware": note["hardware"]}
+
+
+def _make_network(config: TrainConfig) -> torch.nn.Module:
+    """The network as training starts from it."""
+    start, of_ours = config.trunk_weights, config.network == "lite0"
+    network = build_network(
+        config.network, config.descriptor_dim, roles=config.roles, trunk_weights="" if of_ours else start
+    )
+    if start and of_ours:
+        trained = load(start, device="cpu")
+        for name in ("network", "descriptor_dim", "roles"):
+            theirs, asked = getattr(trained.config, name), getattr(config, name)
+            if theirs != asked:
+                raise ValueError(f"trunk_weights {start!r} has {name} {theirs!r}, the training {asked!r}")
+        network.load_state_dict(trained.network.state_dict())
+    return network
 
 
 def _name_hardware(device: torch.device) -> str:

@@ -125,6 +125,33 @@ def test_overwrite_trains_again_to_the_same_weights(cloth_dataset: Path, tmp_pat
     torch.testing.assert_close(second, load_file(tmp_path / "first.safetensors"), rtol=0, atol=0)
 
 
+def test_training_starts_from_trained_weights(cloth_dataset: Path, tmp_path: Path) -> None:
+    first = train(ONE_STEP, cloth_dataset, tmp_path / "first")
+    config = dataclasses.replace(ONE_STEP, trunk_weights=str(first), seed=1, learning_rate=1e-9)
+    went_on = load_file(train(config, cloth_dataset, tmp_path / "second"))
+    for name, value in load_file(first).items():
+        if not name.endswith(("running_mean", "running_var", "num_batches_tracked")):
+            torch.testing.assert_close(went_on[name], value, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"descriptor_dim": 4}, ValueError, "trunk_weights .* has descriptor_dim 8, the training 4"),
+        ({"roles": 2}, ValueError, "trunk_weights .* has roles 1, the training 2"),
+        ({"trunk_weights": "clth"}, FileNotFoundError, "clth must be a safetensors file or one of 'cloth', 'rope'"),
+    ],
+)
+def test_weights_that_cannot_be_started_from(
+    cloth_dataset: Path, tmp_path: Path, change: dict, error: type[Exception], message: str
+) -> None:
+    start = train(ONE_STEP, cloth_dataset, tmp_path / "model")
+    config = dataclasses.replace(ONE_STEP, **{"trunk_weights": str(start), **change})
+    with pytest.raises(error, match=message):
+        train(config, cloth_dataset, tmp_path / "model", overwrite=True)
+    assert start.is_file()  # what is finished is deleted only where it can be made again
+
+
 def test_a_killed_run_ends_with_the_same_weights(cloth_dataset: Path, tmp_path: Path) -> None:
     train_and_kill(LONGER, cloth_dataset, tmp_path / "killed")
     assert not (tmp_path / "killed" / training.WEIGHTS).exists()
