@@ -11,7 +11,7 @@ import pytest
 from dask.distributed import LocalCluster
 
 from mmgsd.config import Preset, load_preset
-from mmgsd.matrix import list_models, run_models, write_main_table
+from mmgsd.matrix import list_models, list_tasks, run_tasks, write_main_table
 
 SMOKE = load_preset("smoke")
 
@@ -32,14 +32,25 @@ def test_the_models_that_matter_most_come_first() -> None:
     assert sum(m.method == "spcl" and m.dense_weight == 1.0 for m in models) == 2
 
 
+def test_baselines_come_before_the_studies() -> None:
+    preset = load_preset("paper")
+    tasks = list_tasks(preset)
+    assert [task for task in tasks if not isinstance(task, tuple)] == list_models(preset)
+    assert tasks[4:8] == [("cloth", "centre"), ("rope", "centre"), ("cloth", "random"), ("rope", "random")]
+    assert {method for _, method in tasks[4:16]} >= {"sift", "orb", "akaze", "daisy"}
+
+
 def test_results_are_written_of_what_is_done(tiny_dataset: Callable[..., Path], tmp_path: Path) -> None:
     preset = make_tiny(tiny_dataset, tmp_path)
     cloth = dataclasses.replace(preset.train["cloth"], steps=1)
     preset = dataclasses.replace(preset, train={**preset.train, "cloth": cloth})
-    ((name, rmse),) = run_models([preset.main_table("cloth")["spcl_dense"]], preset, tmp_path)
+    tasks = [preset.main_table("cloth")["spcl_dense"], ("cloth", "sift")]
+    (_, rmse), (asked, of_sift) = run_tasks(tasks, preset, tmp_path)
+    assert asked == "cloth-sift"
     table = json.loads(write_main_table(preset, tmp_path).read_text())
     assert table["rope"] == {}
     assert table["cloth"]["spcl_dense"]["rmse_mean"] == pytest.approx(rmse, abs=1e-3)
+    assert table["cloth"]["sift"]["rmse_mean"] == pytest.approx(of_sift, abs=1e-3)
     runs = json.loads((tmp_path / "data" / "results" / "smoke" / "runs.json").read_text())
     assert runs["cloth-spcl_dense"]["steps"] == 1
 
@@ -57,8 +68,8 @@ def test_a_cluster_gives_what_this_process_gives(tiny_dataset: Callable[..., Pat
     models = [dataclasses.replace(preset.method(name, "mmgsd"), steps=1) for name in ("cloth", "rope")]
     how = {"n_workers": 1, "threads_per_worker": 1, "processes": False, "dashboard_address": "127.0.0.1:0"}
     with LocalCluster(**how, silence_logs="ERROR") as cluster:
-        there = dict(run_models(models, preset, root, scheduler=cluster.scheduler_address))
+        there = dict(run_tasks(models, preset, root, scheduler=cluster.scheduler_address))
     for model in models:  # made by the cluster, so taken as they are
         assert (root / "data" / "generated" / "smoke" / "models" / model.name / "weights.safetensors").is_file()
-    assert dict(run_models(models, preset, root)) == there
+    assert dict(run_tasks(models, preset, root)) == there
     assert set(there) == {model.name for model in models}
