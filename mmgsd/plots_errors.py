@@ -17,10 +17,10 @@ from mmgsd.matching import Match
 
 TRUE = "#00FF6A"  # the sign of true matches
 QUESTIONS = {
-    "hidden": ("hidden matches", [0, 1, 2, 3, 4, 5]),
-    "seen_target": ("visible share of target", [0, 0.4, 0.6, 0.8, 0.95, 1.01]),
-    "border": ("points to the border", [0, 1, 3, 6, 9, 13]),
-    "covered": ("points to a hidden one", [1, 2, 4, 8, 16, 1000]),
+    "hidden": ("hidden\nmatches", [0, 1, 2, 3, 4, 5]),
+    "seen_target": ("visible share\nof target", [0, 0.4, 0.6, 0.8, 0.95, 1.01]),
+    "border": ("points to\nthe border", [0, 1, 3, 6, 9, 13]),
+    "covered": ("points to\na hidden one", [1, 2, 4, 8, 16, 1000]),
 }
 LENGTHS = {"border": [0, 16, 48, 96, 160, 313], "covered": [1, 4, 16, 48, 96, 1000]}  # the same along a rope
 
@@ -74,8 +74,8 @@ def _draw_states(axis: Axes, means: pd.DataFrame, name: str) -> None:
     middle = np.nanmax(means) / 2
     for (row, column), value in np.ndenumerate(means.to_numpy()):
         axis.text(column, row, f"{value:.0f}", ha="center", va="center", fontsize=6, c="w" if value < middle else "k")
-    axis.set(xticks=range(means.shape[1]), yticks=range(means.shape[0]), title=f"{name}: RMSE (px)", ylabel="source",
-             xlabel="target")  # fmt: skip
+    axis.set(xticks=range(means.shape[1]), yticks=range(means.shape[0]), title=f"{name.capitalize()}: RMSE (px)")
+    axis.set(ylabel="source", xlabel="target")
     axis.set_xticklabels(means.columns, rotation=40, ha="right")
     axis.set_yticklabels(means.index)
 
@@ -85,7 +85,7 @@ def _draw_bins(axis: Axes, table: pd.DataFrame, column: str, edges: Sequence[flo
     means, shares = groups.mean(), groups.size() / len(table)
     axis.bar(range(len(means)), means, color="#D55E00", width=0.75)
     for k, share in enumerate(shares):
-        axis.text(k, 0, f"{100 * share:.0f} %", ha="center", va="bottom", fontsize=5.5, c="w")
+        axis.text(k, 0, f" {100 * share:.0f} %", ha="center", va="bottom", fontsize=5.5, c="w", rotation=90)
     whole = all(float(e).is_integer() for e in edges)
     labels = [_name_bin(i.left, i.right - 1) if whole else f"{i.left:g}–{min(i.right, 1):g}" for i in means.index]
     axis.set_xticks(range(len(means)), labels, rotation=40, ha="right")
