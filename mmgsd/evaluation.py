@@ -208,9 +208,10 @@ def _model_answer(matcher: Matcher, data: Dataset, config: EvaluateConfig) -> An
 def _classical_answer(method: str, data: Dataset) -> Answer:
     images = [data.load_image(i) for i in range(len(data))]
     masks = [data.load_mask(i) for i in range(len(data))]
-    matcher = BaselineMatcher(method)
+    matcher, last = BaselineMatcher(method), np.array(data.size, dtype=np.float32) - 0.5
 
     def answer(first: int, second: int, xy: np.ndarray, n: np.ndarray) -> tuple[Mixture, Tensor]:
+        xy = np.clip(xy, -0.5, last)  # a corner may stick out of the image: the networks take its nearest pixel as well
         heatmap, centres = matcher.compute_heatmaps(images[first], images[second], xy, masks[second])
         return read_heatmap(heatmap, torch.from_numpy(n), centres)
 

@@ -266,3 +266,10 @@ def test_a_model_answers_every_query(cloth_dataset: Path, tmp_path: Path, monkey
     )
     assert np.isfinite(queries.rmse_px).all()
     assert queries[queries["pair"] == 0].n.tolist() == [4, 4, 1, 4, 4]  # points of a diagonal under d4
+
+
+def test_a_point_that_sticks_out_of_the_image_is_asked_at_its_border(cloth_dataset: Path) -> None:
+    answer = evaluation._classical_answer("sift", load_dataset(cloth_dataset, "test"))
+    xy, four = np.float32([[-2.5, 120], [-0.5, 120]]), np.array([4, 4])
+    outside, border = answer(0, 1, xy, four)[0].modes
+    torch.testing.assert_close(outside, border)
