@@ -315,11 +315,9 @@ def _repeatable(device: torch.device) -> Iterator[None]:
 
 def _make_network(config: TrainConfig) -> torch.nn.Module:
     """The network as training starts from it."""
-    start, of_ours = config.trunk_weights, config.network == "lite0"
-    network = build_network(
-        config.network, config.descriptor_dim, roles=config.roles, trunk_weights="" if of_ours else start
-    )
-    if start and of_ours:
+    start = config.trunk_weights
+    network = build_network(config.network, config.descriptor_dim, roles=config.roles, trunk_weights=start)
+    if start and config.network == "lite0":  # of a model of ours; resnet34 has read torchvision's
         trained = load(start, device="cpu")
         for name in ("network", "descriptor_dim", "roles"):
             theirs, asked = getattr(trained.config, name), getattr(config, name)
