@@ -1,6 +1,7 @@
 """Weights that go with the repository: half precision, each with a card that says what it is.
 
-python -m mmgsd.shipping paper      data/generated/paper/models -> data/weights/cloth.safetensors, cloth.md, …
+python -m mmgsd.shipping paper                data/generated/paper/models -> data/weights/cloth.safetensors, cloth.md, …
+python -m mmgsd.shipping paper --restore      and back: evaluation and figures then need no training
 """
 
 from __future__ import annotations
@@ -8,12 +9,13 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shutil
 from pathlib import Path
 
 import torch
 from safetensors.torch import load_file, save_file
 
-from mmgsd.config import OBJECTS, Paths, find_root, load_preset
+from mmgsd.config import OBJECTS, Paths, TrainConfig, find_root, from_dict, load_preset
 from mmgsd.training import WEIGHTS, load_metadata
 
 SHIPPED = {"mmgsd": "", "spcl": "-spcl"}  # method: what its files' names end with
@@ -56,6 +58,23 @@ def ship_model(weights: Path, out: Path, facts: dict) -> Path:
     return out
 
 
+def restore_model(shipped: Path, folder: Path, config: TrainConfig) -> Path:
+    """Copy a shipped model to where training would have left it; the path of its weights, which stay half precision.
+
+    A model that is trained there is left as it is. ValueError where the shipped one has another configuration.
+    """
+    theirs = from_dict(TrainConfig, json.loads(load_metadata(shipped)["config"]))
+    if theirs != config:
+        raise ValueError(f"{shipped} is {theirs.name}, and {config.name} was asked for: train that one")
+    weights = folder / WEIGHTS
+    if not weights.is_file():
+        folder.mkdir(parents=True, exist_ok=True)
+        aside = weights.with_suffix(".tmp")
+        shutil.copyfile(shipped, aside)
+        os.replace(aside, weights)
+    return weights
+
+
 def _holds(file: Path, state: dict[str, torch.Tensor], note: dict[str, str]) -> bool:
     held = load_file(file)
     return (
@@ -66,20 +85,27 @@ def _holds(file: Path, state: dict[str, torch.Tensor], note: dict[str, str]) -> 
 
 
 def main() -> None:
-    """Ship the models of a preset, those that are trained and evaluated."""
+    """Ship the models of a preset, those that are trained and evaluated; or take the shipped ones for trained."""
     parser = argparse.ArgumentParser(prog="python -m mmgsd.shipping", description=__doc__.split("\n")[0])
     parser.add_argument("preset", nargs="?", default="paper")
+    parser.add_argument("--restore", action="store_true", help="shipped models to where training would leave them")
     asked = parser.parse_args()
     config, paths = load_preset(asked.preset), Paths(find_root(), asked.preset)
+    models = {(name, method): config.method(name, method) for name in OBJECTS for method in SHIPPED}
+    shipped = {key: paths.root / "data" / "weights" / f"{key[0]}{SHIPPED[key[1]]}.safetensors" for key in models}
+    if asked.restore:
+        for key, file in shipped.items():
+            if file.is_file():
+                print(restore_model(file, paths.model(models[key]), models[key]))
+        return
     results = json.loads((paths.results / "rmse.json").read_text())
-    for name in OBJECTS:
-        for method, suffix in SHIPPED.items():
-            weights = paths.model(config.method(name, method)) / WEIGHTS
-            if not weights.is_file() or method not in results[name]:
-                print(f"{name} {method}: not trained and evaluated yet")
-                continue
-            facts = {"preset": asked.preset, "data_seed": config.render[name].seed, **results[name][method]}
-            print(ship_model(weights, paths.root / "data" / "weights" / f"{name}{suffix}.safetensors", facts))
+    for (name, method), model in models.items():
+        weights = paths.model(model) / WEIGHTS
+        if not weights.is_file() or method not in results[name]:
+            print(f"{name} {method}: not trained and evaluated yet")
+            continue
+        facts = {"preset": asked.preset, "data_seed": config.render[name].seed, **results[name][method]}
+        print(ship_model(weights, shipped[name, method], facts))
 
 
 if __name__ == "__main__":

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from mmgsd.config import TrainConfig
 from mmgsd.dataset import load_dataset
 from mmgsd.matching import Matcher
-from mmgsd.shipping import ship_model
+from mmgsd.shipping import restore_model, ship_model
 from mmgsd.training import train_model
 
 FACTS = {"preset": "smoke", "data_seed": 7, "rmse_mean": 12.34, "median": 10.0, "queries": 1234}
@@ -32,3 +34,10 @@ def test_half_precision_gives_the_same_answers(tiny_dataset: Callable[..., Path]
         assert said in card
     again = shipped.stat().st_mtime_ns
     assert ship_model(weights, shipped, FACTS).stat().st_mtime_ns == again
+
+    back = restore_model(shipped, tmp_path / "restored", config)
+    assert back.read_bytes() == shipped.read_bytes()
+    assert train_model(config, folder, back.parent, progress=False) == back  # taken for trained, on the same data
+    assert restore_model(shipped, weights.parent, config).read_bytes() != shipped.read_bytes()  # trained here: kept
+    with pytest.raises(ValueError, match="train that one"):
+        restore_model(shipped, tmp_path / "other", dataclasses.replace(config, seed=1))
