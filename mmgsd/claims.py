@@ -87,15 +87,16 @@ def judge_rmse(results: Mapping[str, Any]) -> Claim:
 def judge_improvement(results: Mapping[str, Any]) -> Claim:
     """The distance to the contrastive baseline; SPCL with MMGSD's dense supervision is told beside."""
     gains, dense = ({name: _compute_gain(get(results, "rmse", name), m) for name in OBJECTS} for m in SPCL)
+    equal = {name: _compute_gain(get(results, "budget", name), SPCL[0]) for name in OBJECTS}
     known = None not in gains.values()
     mean = sum(gains.values()) / len(gains) if known else None
     parts = (*(is_at_least(gain, MARGIN) for gain in gains.values()), is_at_least(mean, IMPROVEMENT))
-    shown, beside = (", ".join(f"{n} {_say(v, 'percent')}" for n, v in row.items()) for row in (gains, dense))
-    beside = f"; below SPCL with dense supervision: {beside}" if any(dense.values()) else ""
+    others = {"SPCL with dense supervision": dense, "SPCL, both at the studies' budget": equal}
+    beside = "".join(f"; below {other}: {_list_gains(row)}" for other, row in others.items() if any(row.values()))
     return Claim(
         "improvement", rf"MMGSD's error is {100 * IMPROVEMENT:.1f}\,\% below SPCL's on average.",
         "MMGSD is better, a part each object; the mean of the two improvements is as large, a part.",
-        f"{shown}, mean {_say(mean, 'percent')}{beside}", parts,
+        f"{_list_gains(gains)}, mean {_say(mean, 'percent')}{beside}", parts,
     )  # fmt: skip
 
 
@@ -222,6 +223,10 @@ def _is_greatest(errors: Mapping[str, float | None], place: str, others: Sequenc
 
 def _list(errors: Mapping[str, float | None]) -> str:
     return ", ".join(f"{name} {_say(error)}" for name, error in errors.items()) + "~px" if errors else "--"
+
+
+def _list_gains(gains: Mapping[str, float | None]) -> str:
+    return ", ".join(f"{name} {_say(gain, 'percent')}" for name, gain in gains.items())
 
 
 def _say(value: float | None, kind: str = "px") -> str:

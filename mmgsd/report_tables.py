@@ -27,13 +27,24 @@ def escape(text: str) -> str:
 
 def make_main_table(rmse: Results) -> str:
     """Every method's errors on both objects, of queries with a visible source and of all; the paper's beside."""
+    theirs = {name: [r"\emph{the paper's MMGSD}", rf"\emph{{{error}}}"] for name, error in PAPER.items()}
+    return _make_error_table(rmse, theirs)
+
+
+def make_budget_table(budget: Results) -> str:
+    """The same of the models with the studies' equal, smaller budget."""
+    return _make_error_table(budget, {})
+
+
+def _make_error_table(results: Results, last: Mapping[str, list[str]]) -> str:
     rows: list[Sequence[str] | str] = []
     for name in OBJECTS:
-        rows += [RULE, [name.capitalize()]]
-        for method, label in _choose(rmse.get(name, {})):
-            row = rmse[name][method]
+        if results.get(name) or name in last:
+            rows += [RULE, [name.capitalize()]]
+        for method, label in _choose(results.get(name, {})):
+            row = results[name][method]
             rows.append([label, *_describe_errors(row, ""), *_describe_errors(row, "_all")])
-        rows.append([r"\emph{the paper's MMGSD}", rf"\emph{{{PAPER[name]}}}"])
+        rows += [last[name]] if name in last else []
     measures = ["RMSE", "pooled", "median", r"$\le$5", r"$\le$10", r"$\le$20", "swaps"]
     title = r" & \multicolumn{7}{c}{visible source} & \multicolumn{7}{c}{all points} \\"
     title += r"\cmidrule(lr){2-8}\cmidrule(l){9-15}"
@@ -162,6 +173,7 @@ def _change(before: Results | None, after: Results, measure: str, form: str, sca
 
 TABLES = {
     "main_table": ("rmse", make_main_table),
+    "budget_table": ("budget", make_budget_table),
     "runs_table": ("runs", make_runs_table),
     "sigma_table": ("sigma", make_sigma_table),
     "symmetry_table": ("symmetry", make_symmetry_table),

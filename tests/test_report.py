@@ -41,10 +41,12 @@ def make_results() -> dict:
         for group, errors in inside.items()
     }
     broken = {"cloth, any rotation": 90.0, "cloth, ±45° only": 60.0, "rope, plain": 90.0, "rope, ball at one end": 50.0}
+    small = {"mmgsd": make_errors(40.0), "spcl": make_errors(80.0)}
     run = {"steps": 100, "minutes": 1.5, "images": 95, "seed": 0, "hardware": "CPU, 2 cores"}
     return {
         "rmse": {name: {method: make_errors(e) for method, e in rmse.items()} for name in OBJECTS},
         "runs": {f"{name}-{method}": run for name in OBJECTS for method in METHODS},
+        "budget": {"cloth": {method: {**row, "run": run} for method, row in small.items()}, "rope": {}},
         "sigma": {name: {"1": make_errors(40.0), "4": make_errors(50.0), "16": make_errors(60.0)} for name in OBJECTS},
         "symmetry": {group: {**make_errors(40.0), "regions": regions[group]} for group in GROUPS},
         "broken_symmetry": {name: make_errors(e) for name, e in broken.items()},
@@ -180,6 +182,14 @@ def test_main_table_has_every_method_with_its_numbers() -> None:
         assert [float(c) for c in cells[3:6]] == pytest.approx([100 * metrics[f"pck@{t}px"] for t in PCK_PX], abs=0.051)
         assert float(cells[7]) == pytest.approx(metrics["rmse_mean_all"], abs=0.051) and len(cells) == 14
     assert rows[r"\emph{the paper's MMGSD}"] == [r"\emph{31.3}"]
+
+
+def test_budget_table_has_the_objects_that_were_trained() -> None:
+    results = make_results()
+    text = TABLES["budget_table"][1](results["budget"])
+    assert read_rows(text)["SPCL"][0] == "80.0" and "Cloth" in text and "Rope" not in text and "31.3" not in text
+    improvement = next(claim for claim in list_claims(results) if claim.key == "improvement")
+    assert improvement.measured.endswith(r"budget: cloth 50\,\%, rope --")
 
 
 def test_swap_rate_has_its_column_where_it_was_measured() -> None:
