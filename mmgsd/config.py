@@ -178,7 +178,7 @@ class Preset:
     render: dict[str, RenderConfig]
     train: dict[str, TrainConfig]  # one an object; the other methods replace ``method`` and nothing else
     evaluate: EvaluateConfig
-    ablation: dict[str, TrainConfig]  # the equal budget of the sigma ablation
+    ablation: dict[str, TrainConfig]  # the equal, smaller budget of the studies
     sigmas_px: tuple[float, ...]
 
     def method(self, object: str, method: str) -> TrainConfig:
@@ -192,6 +192,10 @@ class Preset:
         """
         models = {method: self.method(object, method) for method in METHODS}
         return models | {"spcl_dense": dataclasses.replace(models["spcl"], prototype_weight=1.0)}
+
+    def budget_table(self, object: str) -> dict[str, TrainConfig]:
+        """The same models at the smaller budget of the studies."""
+        return dataclasses.replace(self, train=self.ablation).main_table(object)
 
 
 def _preset(

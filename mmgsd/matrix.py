@@ -1,6 +1,7 @@
 """All models of a preset and its baselines as independent tasks, the most important first: here, or on a Dask cluster.
 
     python -m mmgsd.matrix paper                                    trains and asks each model; a killed call goes on
+    python -m mmgsd.matrix paper --only cloth-spcl                  those whose name holds that text
     python -m mmgsd.matrix paper --scheduler tcp://host:8786        each worker one model at a time, on its own GPU
 
 Notebooks find the models and their tables of answers where they would have put them.
@@ -10,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -36,12 +38,13 @@ Task = TrainConfig | tuple[str, str]  # a model to train and ask, or an object a
 
 
 def list_models(preset: Preset, *, seeds: int = 1) -> list[TrainConfig]:
-    """MMGSD and SPCL, the symmetry study, the σ ablation, the rest of the main table, and further seeds."""
+    """MMGSD and SPCL, the studies' models (symmetry, methods, σ), the rest of the main table, and further seeds."""
     first, later = ([preset.main_table(name)[m] for m in methods for name in OBJECTS] for methods in (FIRST, LATER))
+    budget = [preset.budget_table(name)[m] for m in (*FIRST, *LATER) for name in OBJECTS]
     groups = [dataclasses.replace(preset.ablation["cloth"], group=group) for group in GROUPS]
     sigmas = [dataclasses.replace(preset.ablation[name], sigma_px=s) for s in preset.sigmas_px for name in OBJECTS]
     repeated = [dataclasses.replace(config, seed=seed) for seed in range(1, seeds) for config in first]
-    return list(dict.fromkeys([*first, *groups, *sigmas, *later, *repeated]))
+    return list(dict.fromkeys([*first, *groups, *budget, *sigmas, *later, *repeated]))
 
 
 def list_tasks(preset: Preset, *, seeds: int = 1) -> list[Task]:
@@ -50,17 +53,22 @@ def list_tasks(preset: Preset, *, seeds: int = 1) -> list[Task]:
     return [*models[:count], *((name, method) for method in (*CHANCE, *BASELINES) for name in OBJECTS), *models[count:]]
 
 
+def name_task(task: Task) -> str:
+    """What a model's folder is called, or "cloth-sift"."""
+    return task.name if isinstance(task, TrainConfig) else "-".join(task)
+
+
 def run_task(task: Task, preset: Preset, root: Path, *, progress: bool = False) -> tuple[str, float]:
     """Train a model and ask it the preset's questions, or ask a baseline, unless that is done; name and RMSE (px)."""
-    paths = Paths(root, preset.name)
+    paths, name = Paths(root, preset.name), name_task(task)
     if isinstance(task, TrainConfig):
-        name, data, every = task.name, paths.dataset(task.object), max(1, task.steps // VALIDATIONS)
+        data, every = paths.dataset(task.object), max(1, task.steps // VALIDATIONS)
         weights = train_model(task, data, paths.model(task), progress=progress, validate_every=every)
         how = {"group": task.group, "progress": progress}
         out = evaluate_model(weights, data, preset.evaluate, paths.queries(name), **how)
     else:
-        name, data = "-".join(task), paths.dataset(task[0])
-        out = evaluate_baseline(task[1], data, preset.evaluate, paths.queries(name), progress=progress)
+        data, out = paths.dataset(task[0]), paths.queries(name)
+        evaluate_baseline(task[1], data, preset.evaluate, out, progress=progress)
     queries = load_queries(out)
     return name, float(queries.rmse_px[queries.visible].mean())
 
@@ -79,18 +87,39 @@ def run_tasks(tasks: list[Task], preset: Preset, root: Path, *, scheduler: str =
         yield from (future.result() for future in as_completed(futures))
 
 
-def write_main_table(preset: Preset, root: Path) -> Path:
-    """Write rmse.json and runs.json of what is trained and asked so far, as `04_evaluate` does when all is."""
+def write_tables(preset: Preset, root: Path) -> list[Path]:
+    """Write what is trained and asked so far: the main table (rmse.json and runs.json) and that of the equal budget.
+
+    A row of answers that are not here, for they were given on another machine, is kept where it is of the same model.
+    """
     paths = Paths(root, preset.name)
-    tables, runs = {}, {}
+    errors, costs, budget = (_read(paths.results / f"{name}.json") for name in ("rmse", "runs", "budget"))
+    tables, runs, small = {name: {} for name in OBJECTS}, {}, {name: {} for name in OBJECTS}
     for name in OBJECTS:
-        models = {m: c for m, c in preset.main_table(name).items() if paths.queries(c.name).is_file()}
-        files = {m: paths.queries(c.name) for m, c in models.items()}
-        others = {m: paths.queries(f"{name}-{m}") for m in (*BASELINES, *CHANCE)}
-        tables[name] = summarise(files | {m: path for m, path in others.items() if path.is_file()})
-        runs |= {f"{name}-{m}": describe_run(paths.model(c) / WEIGHTS) for m, c in models.items()}
-    write_results(runs, paths.results / "runs.json")
-    return write_results(tables, paths.results / "rmse.json")
+        models = preset.main_table(name)
+        for method in (*models, *BASELINES, *CHANCE):
+            key, stored = f"{name}-{method}", errors.get(name, {}).get(method, {})
+            row, run = _find_row(paths, key, models.get(method), stored, costs.get(key, {}))
+            tables[name] |= {method: row} if row else {}
+            runs |= {key: run} if run else {}
+        for method, model in preset.budget_table(name).items():
+            stored = budget.get(name, {}).get(method, {})
+            row, run = _find_row(paths, "", model, stored, stored.get("run", {}))
+            small[name] |= {method: {**row, "run": run}} if row else {}
+    results = {"runs": runs, "rmse": tables} | ({"budget": small} if any(small.values()) else {})
+    return [write_results(content, paths.results / f"{name}.json") for name, content in results.items()]
+
+
+def _find_row(paths: Paths, key: str, model: TrainConfig | None, row: dict, run: dict) -> tuple[dict, dict]:
+    """Results and cost of a model, or of the baseline ``key``: those of its answers, or else what is stored."""
+    out = paths.queries(model.name if model else key)
+    if out.is_file():
+        return summarise({key: out})[key], describe_run(paths.model(model) / WEIGHTS) if model else {}
+    return (row, run) if model is None or run.get("model") == model.name else ({}, {})
+
+
+def _read(path: Path) -> dict:
+    return json.loads(path.read_text()) if path.is_file() else {}
 
 
 def main() -> None:
@@ -98,14 +127,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m mmgsd.matrix", description=__doc__.split("\n")[0])
     parser.add_argument("preset")
     parser.add_argument("--seeds", type=int, default=1, help="of mmgsd and spcl (default %(default)s)")
+    parser.add_argument("--only", default="", help="those whose name holds this text, like cloth or cloth-spcl")
     parser.add_argument("--scheduler", default="", help="address of a Dask scheduler; none: this process")
     asked = parser.parse_args()
     preset = load_preset(asked.preset)
-    tasks = list_tasks(preset, seeds=asked.seeds)
+    tasks = [task for task in list_tasks(preset, seeds=asked.seeds) if asked.only in name_task(task)]
+    if not tasks:
+        parser.error(f"--only {asked.only!r}: no model or baseline of the preset {preset.name} has a name with that")
     done = run_tasks(tasks, preset, find_root(), scheduler=asked.scheduler)
     for name, rmse in tqdm(done, total=len(tasks), desc="models and baselines"):
         tqdm.write(f"{name}: {rmse:.1f} px")
-        write_main_table(preset, find_root())
+        write_tables(preset, find_root())
 
 
 if __name__ == "__main__":

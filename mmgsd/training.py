@@ -24,7 +24,7 @@ from tqdm.auto import tqdm
 
 from mmgsd import distributed, losses
 from mmgsd.augmentation import Batch, load_training_images, make_batch
-from mmgsd.config import TrainConfig
+from mmgsd.config import TrainConfig, from_dict
 from mmgsd.dataset import Dataset, hold_out, load_dataset
 from mmgsd.evaluation import calibrate_bandwidth, calibrate_temperature, measure_rmse
 from mmgsd.losses import CONTRASTIVE, MATCHES_OF_ONE
@@ -295,11 +295,11 @@ def load_metadata(weights: Path | str) -> dict[str, str]:
 
 
 def describe_run(weights: Path | str) -> dict[str, int | float | str]:
-    """What a model cost: steps, minutes, training images, seed, hardware."""
+    """Which model it is and what it cost: its name, steps, minutes, training images, seed, hardware."""
     note = load_metadata(weights)
-    config, minutes = json.loads(note["config"]), round(float(note["seconds"]) / 60, 2)
-    run = {"steps": config["steps"], "minutes": minutes, "images": int(note["images"])}
-    return {**run, "seed": config["seed"], "hardware": note["hardware"]}
+    config, minutes = from_dict(TrainConfig, json.loads(note["config"])), round(float(note["seconds"]) / 60, 2)
+    run = {"model": config.name, "steps": config.steps, "minutes": minutes, "images": int(note["images"])}
+    return {**run, "seed": config.seed, "hardware": note["hardware"]}
 
 
 @contextmanager

@@ -10,8 +10,9 @@ from pathlib import Path
 import pytest
 from dask.distributed import LocalCluster
 
+from mmgsd import matrix
 from mmgsd.config import Preset, load_preset
-from mmgsd.matrix import list_models, list_tasks, run_tasks, write_main_table
+from mmgsd.matrix import list_models, list_tasks, run_tasks, write_tables
 
 SMOKE = load_preset("smoke")
 
@@ -22,14 +23,16 @@ def test_the_models_that_matter_most_come_first() -> None:
         ("cloth", "mmgsd"), ("rope", "mmgsd"), ("cloth", "spcl"), ("rope", "spcl")
     ]  # fmt: skip
     assert [m.group for m in models[4:7]] == ["c4", "v4", "d4"]  # the studies, then the rest of the main table
-    order = [m.method for m in models]
-    assert order.index("unimodal") > max(i for i, m in enumerate(models) if m.sigma_px == 16)
+    order, steps = [m.method for m in models], [m.steps for m in models]
+    assert models[4] == load_preset("paper").budget_table("cloth")["mmgsd"]  # one model, two tables
+    assert max(i for i, m in enumerate(models) if m.sigma_px == 16) == max(i for i, n in enumerate(steps) if n == 1000)
+    assert set(steps[4:24]) == {1000} and set(steps[24:]) == {4000}
     assert order[-8:] == ["mmgsd", "mmgsd", "spcl", "spcl"] * 2
     assert len({m.name for m in models}) == len(models)
     assert {m.group for m in models if m.object == "cloth"} == {"c4", "v4", "d4"}
     assert sorted({m.sigma_px for m in models}) == [1.0, 2.0, 4.0, 8.0, 16.0]
     assert {m.seed for m in models if m.method == "mmgsd"} == {0, 1, 2}
-    assert sum(m.method == "spcl" and m.dense_weight == 1.0 for m in models) == 2
+    assert sum(m.method == "spcl" and m.dense_weight == 1.0 for m in models) == 4
 
 
 def test_baselines_come_before_the_studies() -> None:
@@ -44,15 +47,44 @@ def test_results_are_written_of_what_is_done(tiny_dataset: Callable[..., Path], 
     preset = make_tiny(tiny_dataset, tmp_path)
     cloth = dataclasses.replace(preset.train["cloth"], steps=1)
     preset = dataclasses.replace(preset, train={**preset.train, "cloth": cloth})
-    tasks = [preset.main_table("cloth")["spcl_dense"], ("cloth", "sift")]
-    (_, rmse), (asked, of_sift) = run_tasks(tasks, preset, tmp_path)
+    small = dataclasses.replace(preset.ablation["cloth"], steps=1, seed=1)
+    preset = dataclasses.replace(preset, ablation={**preset.ablation, "cloth": small})
+    tasks = [preset.main_table("cloth")["spcl_dense"], ("cloth", "sift"), preset.budget_table("cloth")["pcl"]]
+    (_, rmse), (asked, of_sift), (_, of_pcl) = run_tasks(tasks, preset, tmp_path)
     assert asked == "cloth-sift"
-    table = json.loads(write_main_table(preset, tmp_path).read_text())
+    table = read_results(preset, tmp_path)
     assert table["rope"] == {}
     assert table["cloth"]["spcl_dense"]["rmse_mean"] == pytest.approx(rmse, abs=1e-3)
     assert table["cloth"]["sift"]["rmse_mean"] == pytest.approx(of_sift, abs=1e-3)
     runs = json.loads((tmp_path / "data" / "results" / "smoke" / "runs.json").read_text())
     assert runs["cloth-spcl_dense"]["steps"] == 1
+    budget = json.loads((tmp_path / "data" / "results" / "smoke" / "budget.json").read_text())
+    assert budget["cloth"].keys() == {"pcl"} and budget["cloth"]["pcl"]["run"]["seed"] == 1
+    assert budget["cloth"]["pcl"]["rmse_mean"] == pytest.approx(of_pcl, abs=1e-3)
+    for file in (tmp_path / "data" / "generated" / "smoke" / "queries").iterdir():  # as on another machine
+        file.unlink()
+    kept = read_results(preset, tmp_path)
+    assert kept == table
+    changed = dataclasses.replace(preset, train={**preset.train, "cloth": dataclasses.replace(cloth, steps=2)})
+    assert read_results(changed, tmp_path)["cloth"].keys() == {"sift"}
+
+
+def test_some_can_be_chosen_by_name(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    asked = []
+    monkeypatch.setattr(matrix, "run_tasks", lambda tasks, *_, **__: asked.extend(tasks) or iter(()))
+    monkeypatch.setattr("sys.argv", ["mmgsd.matrix", "paper", "--only", "rope-spcl"])
+    matrix.main()
+    assert [(m.object, m.method) for m in asked] == [("rope", "spcl")] * 4
+    assert [m.steps for m in asked] == [4000, 1000, 1000, 4000]
+    monkeypatch.setattr("sys.argv", ["mmgsd.matrix", "paper", "--only", "shirt"])
+    with pytest.raises(SystemExit):
+        matrix.main()
+    assert "'shirt'" in capsys.readouterr().err
+
+
+def read_results(preset: Preset, root: Path) -> dict[str, dict]:
+    write_tables(preset, root)
+    return json.loads((root / "data" / "results" / "smoke" / "rmse.json").read_text())
 
 
 def make_tiny(tiny_dataset: Callable[..., Path], root: Path) -> Preset:
