@@ -56,6 +56,6 @@ def plot_symmetry_study(tables: Mapping[str, pd.DataFrame]) -> Figure:
             axis.bar(np.arange(len(rows)) + (k - (len(tables) - 1) / 2) * 0.26, heights, 0.24, label=group)
         axis.set(title=label, xticks=range(len(rows)))
         axis.set_xticklabels(rows, rotation=30, ha="right")
-    axes[-2].legend(handlelength=1, loc="lower right", framealpha=0.8, frameon=True)
+    axes[-2].legend(handlelength=1, loc="best", framealpha=0.8, frameon=True)
     axes[-1].set_ylim(bottom=min(r["entropy"] or 0 for rows in regions.values() for r in rows.values()) - 1)
     return finish_axes(figure, keep_box=axes[: len(tables)])
