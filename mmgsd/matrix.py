@@ -90,7 +90,7 @@ def run_tasks(tasks: list[Task], preset: Preset, root: Path, *, scheduler: str =
 def write_tables(preset: Preset, root: Path) -> list[Path]:
     """Write what is trained and asked so far: the main table (rmse.json and runs.json) and that of the equal budget.
 
-    A row of answers that are not here, for they were given on another machine, is kept where it is of the same model.
+    Where the answers are not here, given on another machine, the row that is there is kept if it is of the same model.
     """
     paths = Paths(root, preset.name)
     errors, costs, budget = (_read(paths.results / f"{name}.json") for name in ("rmse", "runs", "budget"))

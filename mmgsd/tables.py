@@ -37,7 +37,7 @@ def make_results_table(results: dict[str, dict[str, dict[str, float]]], *, paper
 
 
 def make_budget_table(results: dict[str, dict[str, dict[str, float]]]) -> str:
-    """`make_results_table` of models trained for less long than the paper's numbers are to be compared with."""
+    """`make_results_table` without the paper's errors: its models were not trained on the studies' smaller budget."""
     return make_results_table(results, paper=False)
 
 
