@@ -13,6 +13,7 @@ import json
 import math
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -196,6 +197,11 @@ class Preset:
     def budget_table(self, object: str) -> dict[str, TrainConfig]:
         """The same models at the smaller budget of the studies."""
         return dataclasses.replace(self, train=self.ablation).main_table(object)
+
+    def sigma_table(self, object: str, sigmas_px: Sequence[float] = ()) -> dict[str, TrainConfig]:
+        """MMGSD at that budget with each σ, of the preset where ``sigmas_px`` names none: {"4": …}."""
+        chosen = sorted({float(sigma) for sigma in sigmas_px or self.sigmas_px})
+        return {f"{sigma:g}": dataclasses.replace(self.ablation[object], sigma_px=sigma) for sigma in chosen}
 
 
 def _preset(

@@ -12,7 +12,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from dask.distributed import Client, as_completed
@@ -42,7 +42,7 @@ def list_models(preset: Preset, *, seeds: int = 1) -> list[TrainConfig]:
     first, later = ([preset.main_table(name)[m] for m in methods for name in OBJECTS] for methods in (FIRST, LATER))
     budget = [preset.budget_table(name)[m] for m in (*FIRST, *LATER) for name in OBJECTS]
     groups = [dataclasses.replace(preset.ablation["cloth"], group=group) for group in GROUPS]
-    sigmas = [dataclasses.replace(preset.ablation[name], sigma_px=s) for s in preset.sigmas_px for name in OBJECTS]
+    sigmas = [preset.sigma_table(name)[sigma] for sigma in preset.sigma_table("cloth") for name in OBJECTS]
     repeated = [dataclasses.replace(config, seed=seed) for seed in range(1, seeds) for config in first]
     return list(dict.fromkeys([*first, *groups, *budget, *sigmas, *later, *repeated]))
 
@@ -87,14 +87,21 @@ def run_tasks(tasks: list[Task], preset: Preset, root: Path, *, scheduler: str =
         yield from (future.result() for future in as_completed(futures))
 
 
-def write_tables(preset: Preset, root: Path) -> list[Path]:
-    """Write what is trained and asked so far: the main table (rmse.json and runs.json) and that of the equal budget.
+def write_tables(preset: Preset, root: Path) -> None:
+    """Write what is trained and asked so far: the main table, that of the equal budget, and that of σ.
 
     Where the answers are not here, given on another machine, the row that is there is kept if it is of the same model.
     """
+    write_main_table(preset, root)
+    _write_study({name: preset.budget_table(name) for name in OBJECTS}, Paths(root, preset.name), "budget")
+    write_sigma_table(preset, root)
+
+
+def write_main_table(preset: Preset, root: Path) -> None:
+    """Write rmse.json and runs.json, by the rule of `write_tables`."""
     paths = Paths(root, preset.name)
-    errors, costs, budget = (_read(paths.results / f"{name}.json") for name in ("rmse", "runs", "budget"))
-    tables, runs, small = {name: {} for name in OBJECTS}, {}, {name: {} for name in OBJECTS}
+    errors, costs = (_read(paths.results / f"{name}.json") for name in ("rmse", "runs"))
+    tables, runs = {name: {} for name in OBJECTS}, {}
     for name in OBJECTS:
         models = preset.main_table(name)
         for method in (*models, *BASELINES, *CHANCE):
@@ -102,12 +109,29 @@ def write_tables(preset: Preset, root: Path) -> list[Path]:
             row, run = _find_row(paths, key, models.get(method), stored, costs.get(key, {}))
             tables[name] |= {method: row} if row else {}
             runs |= {key: run} if run else {}
-        for method, model in preset.budget_table(name).items():
-            stored = budget.get(name, {}).get(method, {})
-            row, run = _find_row(paths, "", model, stored, stored.get("run", {}))
-            small[name] |= {method: {**row, "run": run}} if row else {}
-    results = {"runs": runs, "rmse": tables} | ({"budget": small} if any(small.values()) else {})
-    return [write_results(content, paths.results / f"{name}.json") for name, content in results.items()]
+    write_results(runs, paths.results / "runs.json")
+    write_results(tables, paths.results / "rmse.json")
+
+
+def write_sigma_table(preset: Preset, root: Path, sigmas_px: Sequence[float] = ()) -> None:
+    """Write sigma.json, by the rule of `write_tables`; ``sigmas_px`` besides the preset's and those that are there."""
+    paths = Paths(root, preset.name)
+    there = [float(sigma) for rows in _read(paths.results / "sigma.json").values() for sigma in rows]
+    models = {name: preset.sigma_table(name, [*preset.sigmas_px, *sigmas_px, *there]) for name in OBJECTS}
+    _write_study(models, paths, "sigma")
+
+
+def _write_study(models: dict[str, dict[str, TrainConfig]], paths: Paths, study: str) -> None:
+    """One file {object: {key: errors, and under "run" the cost}} of models under the same keys, where any is done."""
+    stored, rows = _read(paths.results / f"{study}.json"), {}
+    for name, keyed in models.items():
+        for key, model in keyed.items():
+            kept = stored.get(name, {}).get(key, {})
+            row, run = _find_row(paths, "", model, kept, kept.get("run", {}))
+            if row:
+                rows.setdefault(name, {})[key] = {**row, "run": run}
+    if rows or stored:
+        write_results(rows, paths.results / f"{study}.json")
 
 
 def _find_row(paths: Paths, key: str, model: TrainConfig | None, row: dict, run: dict) -> tuple[dict, dict]:

@@ -81,8 +81,9 @@ def plot_combined(
 ) -> Figure:  # fmt: skip
     """A: contrastive answers, B: the true and MMGSD's distribution of the same query, C: queries moved inwards.
 
-    ``answers`` {object: {"pcl", "spcl", "mmgsd": match}}, first query of each; ``true`` {object: (n, 2) px}, drawn as
-    Gaussians of ``sigma_px``, wide enough to be seen; ``inwards`` {object: match of four queries, extremity first}.
+    ``answers`` {object: {"pcl", "spcl", "mmgsd": match}}, first query of each, contrastive ones where they are
+    trained; ``true`` {object: (n, 2) px}, drawn as Gaussians of ``sigma_px``, wide enough to be seen; ``inwards``
+    {object: match of four queries, extremity first}.
     """
     check_filled("answers", answers)
     for name, match in inwards.items():
@@ -132,10 +133,12 @@ def plot_spatial_rmse(
 ) -> Figure:
     """Mean error over the rope's length for every method (1-D), and over the cloth's area for those ``mapped`` (2-D).
 
-    ``tables`` {"rope", "cloth": {method: queries}}; the maps share one scale, points never asked stay grey.
+    ``tables`` {"rope", "cloth": {method: queries}}; the maps, of the ``mapped`` that are in it, share one scale, points
+    never asked stay grey.
     """
     for name in ("rope", "cloth"):
         check_filled(f"tables[{name!r}]", tables.get(name, {}))
+    mapped = [method for method in mapped if method in tables["cloth"]]
     figure, axes = plt.subplots(1, 1 + len(mapped), figsize=(PAGE_IN, 2.1), layout="constrained",
                                 width_ratios=[2.0] + [1.0] * len(mapped))  # fmt: skip
     for method, queries in tables["rope"].items():
@@ -316,7 +319,11 @@ def _draw_comparison(line: Sequence[Axes], methods: Mapping[str, Match], true: n
     match = methods["mmgsd"]
     show_source(line[0], match, 0)
     for axis, method in zip(line[[1, 2, 4]], ("pcl", "spcl", "mmgsd"), strict=True):
-        show_answer(axis, methods[method], 0, modes=False)
+        if method in methods:
+            show_answer(axis, methods[method], 0, modes=False)
+        else:
+            axis.set_axis_off()
+            axis.text(0.5, 0.5, "not trained", ha="center", va="center", fontsize=6, transform=axis.transAxes)
     ys, xs = np.mgrid[: match.image1.shape[0], : match.image1.shape[1]]
     mixture = sum(np.exp(-((xs - x) ** 2 + (ys - y) ** 2) / (2 * sigma_px**2)) for x, y in true)
     line[3].imshow(blend_heatmap(match.image1, mixture))

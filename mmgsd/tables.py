@@ -26,7 +26,7 @@ def make_results_table(results: dict[str, dict[str, dict[str, float]]], *, paper
         "|---|---|---|---|---|---|---|",
     ]
     for method, label in LABELS.items():
-        rows = [results[object].get(method) for object in PAPER]
+        rows = [results.get(object, {}).get(method) for object in PAPER]
         if any(rows):  # SURF is not in every OpenCV
             cells = [_format_errors(r) if r else "– | – | –" for r in rows]
             lines.append(f"| {label} | {' | '.join(cells)} |")

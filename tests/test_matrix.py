@@ -12,6 +12,7 @@ from dask.distributed import LocalCluster
 
 from mmgsd import matrix
 from mmgsd.config import Preset, load_preset
+from mmgsd.evaluation import write_results
 from mmgsd.matrix import list_models, list_tasks, run_tasks, write_tables
 
 SMOKE = load_preset("smoke")
@@ -49,22 +50,29 @@ def test_results_are_written_of_what_is_done(tiny_dataset: Callable[..., Path], 
     preset = dataclasses.replace(preset, train={**preset.train, "cloth": cloth})
     small = dataclasses.replace(preset.ablation["cloth"], steps=1, seed=1)
     preset = dataclasses.replace(preset, ablation={**preset.ablation, "cloth": small})
+    asked_by_hand = preset.sigma_table("cloth", [3])["3"]  # no σ of the preset
     tasks = [preset.main_table("cloth")["spcl_dense"], ("cloth", "sift"), preset.budget_table("cloth")["pcl"]]
-    (_, rmse), (asked, of_sift), (_, of_pcl) = run_tasks(tasks, preset, tmp_path)
+    (_, rmse), (asked, of_sift), (_, of_pcl), (_, of_sigma) = run_tasks([*tasks, asked_by_hand], preset, tmp_path)
+    results = tmp_path / "data" / "results" / "smoke"
+    write_results({"cloth": {"3": {}, "5": {"run": {"model": "another"}}}}, results / "sigma.json")
     assert asked == "cloth-sift"
     table = read_results(preset, tmp_path)
     assert table["rope"] == {}
     assert table["cloth"]["spcl_dense"]["rmse_mean"] == pytest.approx(rmse, abs=1e-3)
     assert table["cloth"]["sift"]["rmse_mean"] == pytest.approx(of_sift, abs=1e-3)
-    runs = json.loads((tmp_path / "data" / "results" / "smoke" / "runs.json").read_text())
+    runs = json.loads((results / "runs.json").read_text())
     assert runs["cloth-spcl_dense"]["steps"] == 1
-    budget = json.loads((tmp_path / "data" / "results" / "smoke" / "budget.json").read_text())
+    budget, sigma = (json.loads((results / f"{name}.json").read_text()) for name in ("budget", "sigma"))
     assert budget["cloth"].keys() == {"pcl"} and budget["cloth"]["pcl"]["run"]["seed"] == 1
     assert budget["cloth"]["pcl"]["rmse_mean"] == pytest.approx(of_pcl, abs=1e-3)
+    assert sigma.keys() == {"cloth"} and sigma["cloth"].keys() == {"3"}
+    assert sigma["cloth"]["3"]["rmse_mean"] == pytest.approx(of_sigma, abs=1e-3)
     for file in (tmp_path / "data" / "generated" / "smoke" / "queries").iterdir():  # as on another machine
         file.unlink()
     kept = read_results(preset, tmp_path)
     assert kept == table
+    assert json.loads((results / "sigma.json").read_text()) == sigma
+    assert json.loads((results / "budget.json").read_text()) == budget
     changed = dataclasses.replace(preset, train={**preset.train, "cloth": dataclasses.replace(cloth, steps=2)})
     assert read_results(changed, tmp_path)["cloth"].keys() == {"sift"}
 

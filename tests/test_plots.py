@@ -79,6 +79,13 @@ def test_plot_combined_has_five_columns():
     assert shown[10, 10, 0] > 0.9  # the heatmap's brightest colour at a true mode
 
 
+def test_plot_combined_says_what_is_not_trained():
+    methods = {method: make_match() for method in ("spcl", "mmgsd")}
+    figure = plots.plot_combined({"rope": methods}, {"rope": np.array([[10.0, 10.0]])}, {})
+    assert [len(axis.images) for axis in figure.axes] == [1, 0, 1, 1, 1]
+    assert [text.get_text() for text in figure.axes[1].texts] == ["not trained"]
+
+
 def test_plot_combined_wants_four_queries_inwards():
     with pytest.raises(ValueError, match="must hold 4 queries, got 3"):
         plots.plot_combined({"rope": {"mmgsd": make_match()}}, {}, {"rope": make_match(3)})
@@ -115,6 +122,9 @@ def test_plot_spatial_rmse_draws_lines_and_maps(points):
     assert [float(v.mean()) for v in values] == pytest.approx([20, 40])
     limits = {axis.images[0].get_clim() for axis in figure.axes[1:3]}
     assert limits == {(0.0, 40.0)}
+    tables = make_tables(points)
+    del tables["cloth"]["spcl"]  # not trained
+    assert len(plots.plot_spatial_rmse(tables).axes) == 3
 
 
 def test_compute_point_errors_is_nan_where_never_asked():
