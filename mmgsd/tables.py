@@ -6,6 +6,7 @@ import json
 import os
 import sys
 from pathlib import Path
+from typing import Any
 
 PAPER = {"cloth": 32.4, "rope": 31.3}  # px, MMGSD's RMSE as the paper reports it
 LABELS = {
@@ -14,31 +15,51 @@ LABELS = {
     "sift": "SIFT", "orb": "ORB", "akaze": "AKAZE", "daisy": "DAISY", "surf": "SURF",
     "random": "random points", "centre": "object's centre",
 }  # fmt: skip
+GROUPS = {"v4": "`v4`, the flips", "c4": "`c4`, the rotations", "d4": "`d4`, all eight"}
+
+Errors = dict[str, dict[str, dict[str, float]]]  # {object: {method, or σ: {metric: value}}}
 
 
-def make_results_table(results: dict[str, dict[str, dict[str, float]]], *, paper: bool = True) -> str:
-    """Markdown from {object: {method: {metric: value}}}: RMSE, median and pck of both objects, a method a row.
-
-    A dash stands for what has not been run. ``paper`` adds the paper's own errors.
-    """
-    lines = [
-        "| | cloth: RMSE px | median px | pck@20px | rope: RMSE px | median px | pck@20px |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for method, label in LABELS.items():
-        rows = [results.get(object, {}).get(method) for object in PAPER]
-        if any(rows):  # SURF is not in every OpenCV
-            cells = [_format_errors(r) if r else "– | – | –" for r in rows]
-            lines.append(f"| {label} | {' | '.join(cells)} |")
+def make_results_table(results: Errors, *, paper: bool = True) -> str:
+    """Markdown of RMSE, median and pck of both objects, a method a row; ``paper`` adds the paper's own errors."""
+    lines = _make_lines("", results, LABELS)
     if paper:
         theirs = [f"*{PAPER[object]}* | – | –" for object in PAPER]
         lines.append(f"| *the paper's MMGSD, 3,500 images each* | {' | '.join(theirs)} |")
     return "\n".join(lines)
 
 
-def make_budget_table(results: dict[str, dict[str, dict[str, float]]]) -> str:
+def make_budget_table(results: Errors) -> str:
     """`make_results_table` without the paper's errors: its models were not trained on the studies' smaller budget."""
     return make_results_table(results, paper=False)
+
+
+def make_sigma_table(results: Errors) -> str:
+    """The same measures of MMGSD by the std of its targets."""
+    sigmas = sorted({sigma for rows in results.values() for sigma in rows}, key=float)
+    return "\n".join(_make_lines("σ px", results, {sigma: sigma for sigma in sigmas}))
+
+
+def make_symmetry_table(results: dict[str, dict[str, Any]]) -> str:
+    """Markdown from {group: errors, and under "regions" those by place}, a group a row."""
+    lines = ["| taught and asked | all | corners | edges | interior |", "|---|---|---|---|---|"]
+    for group, row in results.items():
+        errors = [row["rmse_mean"], *(row["regions"][region]["rmse_px"] for region in ("corner", "edge", "interior"))]
+        lines.append(f"| {GROUPS[group]} | {' | '.join(f'{error:.1f}' for error in errors)} |")
+    return "\n".join(lines)
+
+
+def _make_lines(first: str, results: Errors, labels: dict[str, str]) -> list[str]:
+    """A heading, and a row for each label whose key is in the results; a dash stands for what has not been run."""
+    measures = "RMSE px | median px | pck@20px"
+    heads = [f"{object}: {measures}" for object in PAPER]
+    lines = [f"| {first}".rstrip() + f" | {' | '.join(heads)} |", "|---" * 7 + "|"]
+    for key, label in labels.items():
+        rows = [results.get(object, {}).get(key) for object in PAPER]
+        if any(rows):  # SURF is not in every OpenCV
+            cells = [_format_errors(row) if row else "– | – | –" for row in rows]
+            lines.append(f"| {label} | {' | '.join(cells)} |")
+    return lines
 
 
 def _format_errors(row: dict[str, float]) -> str:
@@ -86,6 +107,8 @@ if __name__ == "__main__":
     for part, file, make in (
         ("paper", "paper/rmse.json", make_results_table),
         ("budget", "paper/budget.json", make_budget_table),
+        ("sigma", "paper/sigma.json", make_sigma_table),
+        ("symmetry", "paper/symmetry.json", make_symmetry_table),
         ("results", "quick/rmse.json", make_results_table),
         ("uncertainty", "quick/uncertainty.json", make_uncertainty_table),
     ):

@@ -4,7 +4,15 @@ from pathlib import Path
 
 import pytest
 
-from mmgsd.tables import LABELS, make_budget_table, make_results_table, make_uncertainty_table, update_readme
+from mmgsd.tables import (
+    LABELS,
+    make_budget_table,
+    make_results_table,
+    make_sigma_table,
+    make_symmetry_table,
+    make_uncertainty_table,
+    update_readme,
+)
 
 RESULTS = {
     object: {method: {"rmse_mean": 10.0 * i + 1, "median": 5.0, "pck@20px": 0.5} for i, method in enumerate(LABELS)}
@@ -33,6 +41,20 @@ def test_what_was_run_on_one_object_only_has_dashes() -> None:
     results = {**RESULTS, "rope": {}}
     row = make_results_table(results).splitlines()[2]
     assert row == "| **MMGSD** (ours) | 1.0 | 5.0 | 50 % | – | – | – |"
+
+
+def test_sigmas_are_in_order_of_their_width() -> None:
+    row = RESULTS["cloth"]["spcl"]
+    rows = make_sigma_table({"cloth": {"16": row, "2": row}, "rope": {"2": row}}).splitlines()
+    assert rows[0].startswith("| σ px | cloth: RMSE px | median px | pck@20px | rope: RMSE px")
+    assert [line.split(" | ")[0] for line in rows[2:]] == ["| 2", "| 16"]
+    assert rows[3].endswith("| 50 % | – | – | – |")
+
+
+def test_a_group_has_its_errors_by_place() -> None:
+    regions = {region: {"rmse_px": 10.0 * i} for i, region in enumerate(("corner", "edge", "interior"), start=1)}
+    table = make_symmetry_table({"c4": {"rmse_mean": 15.04, "regions": regions}})
+    assert table.splitlines()[2:] == ["| `c4`, the rotations | 15.0 | 10.0 | 20.0 | 30.0 |"]
 
 
 def test_uncertainty_before_and_after() -> None:
