@@ -330,7 +330,8 @@ def _make_network(config: TrainConfig) -> torch.nn.Module:
 def _name_hardware(device: torch.device) -> str:
     if device.type == "cuda":
         return torch.cuda.get_device_name(device)
-    return f"CPU, {os.cpu_count()} cores"
+    threads, cores = torch.get_num_threads(), os.cpu_count()
+    return f"CPU, {cores} cores" if threads >= cores else f"CPU, {threads} of {cores} cores"
 
 
 def _cosine(progress: float) -> float:
