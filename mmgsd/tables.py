@@ -30,7 +30,7 @@ def make_results_table(results: Errors, *, paper: bool = True) -> str:
 
 
 def make_budget_table(results: Errors) -> str:
-    """`make_results_table` without the paper's errors: its models were not trained on the studies' smaller budget."""
+    """`make_results_table` without the paper's errors, which are not of this smaller budget."""
     return make_results_table(results, paper=False)
 
 
