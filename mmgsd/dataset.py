@@ -78,8 +78,14 @@ class Dataset:
 
     @property
     def fingerprint(self) -> str:
-        """Sixteen hexadecimal digits of what was rendered, with which versions, and how it was packed, if it was."""
-        text = json.dumps([self.info[k] for k in ("config", "versions", "packed") if k in self.info], sort_keys=True)
+        """Sixteen hexadecimal digits of what was rendered, with which versions, and how it was packed, if it was.
+
+        The first version of the scenes has no number in it: data rendered before they were counted are the same.
+        """
+        made = {key: self.info[key] for key in ("config", "versions", "packed") if key in self.info}
+        if "versions" in made:
+            made["versions"] = {k: v for k, v in made["versions"].items() if (k, v) != ("scenes", 1)}
+        text = json.dumps(list(made.values()), sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def group(self, name: str = "") -> SymmetryGroup:

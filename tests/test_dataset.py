@@ -155,6 +155,19 @@ def test_groups_are_data(cloth_dataset: Path) -> None:
         data.group("c3")
 
 
+def test_fingerprint_is_that_of_the_scenes(tiny_dataset: Callable[..., Path]) -> None:
+    """Data from before the scenes were counted are those of the first ones: models stay theirs."""
+    folder = tiny_dataset()
+    versions = {k: v for k, v in load_dataset(folder, "test").info["versions"].items() if k != "scenes"}
+
+    def fingerprint(**scenes: int | str) -> str:
+        set_info(versions={**scenes, **versions})(folder)
+        return load_dataset(folder, "test").fingerprint
+
+    assert fingerprint() == fingerprint(scenes=1)
+    assert len({fingerprint(), fingerprint(scenes=2), fingerprint(scenes="1-12345678")}) == 3
+
+
 def test_unknown_split(cloth_dataset: Path) -> None:
     with pytest.raises(ValueError, match=r"split must be one of \('train', 'test'\), got 'validation'"):
         load_dataset(cloth_dataset, "validation")
