@@ -31,7 +31,8 @@ Descriptors of the method `{method}` for a {object}, symmetry group `{group}`; `
 | file | {megabytes:.1f} MB, safetensors, weights in half precision |
 
 Known limits: rendered images only, one object wholly in view and seen from above. Matches that are
-hidden in the image are guessed. The numbers are those of the weights before they were rounded to half precision.
+hidden in the image are guessed. The weights may have been asked before they were rounded to half precision, which does
+not show in these numbers.
 """
 
 
