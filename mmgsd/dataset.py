@@ -80,11 +80,11 @@ class Dataset:
     def fingerprint(self) -> str:
         """Sixteen hexadecimal digits of what was rendered, with which versions, and how it was packed, if it was.
 
-        The first version of the scenes has no number in it: data rendered before they were counted are the same.
+        Data that do not name the version of their scenes are from before these were counted: of the first.
         """
         made = {key: self.info[key] for key in ("config", "versions", "packed") if key in self.info}
         if "versions" in made:
-            made["versions"] = {k: v for k, v in made["versions"].items() if (k, v) != ("scenes", 1)}
+            made["versions"] = {"scenes": 1, **made["versions"]}
         text = json.dumps(list(made.values()), sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
