@@ -62,8 +62,8 @@ figures: $(STAMP) ## Draw the paper's figures of PRESET (paper) again from data/
 	@mkdir -p data/generated
 	$(PAPERMILL) notebooks/07_figures.ipynb data/generated/figures_$(PRESET).ipynb -p preset $(PRESET)
 
-readme: $(STAMP) ## Put the numbers of data/results into the README
-	$(PY) -m mmgsd.tables data/results README.md
+readme: $(STAMP) ## Put the numbers of data/results into the tables of README.md and data/results/README.md
+	$(PY) -m mmgsd.tables data/results README.md data/results/README.md
 
 data-pack: $(STAMP) ## Pack the data sets of PRESET (paper) into data/packs, to travel to another machine
 	$(PY) -m mmgsd.packing pack $(PRESET)

@@ -1,10 +1,12 @@
-"""The README's tables, made from the results files: ``python -m mmgsd.tables data/results README.md``."""
+"""The tables of Markdown files, made from the results: ``python -m mmgsd.tables data/results README.md``."""
 
 from __future__ import annotations
 
 import json
 import os
+import re
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -90,26 +92,39 @@ def _format_uncertainty(after: dict[str, float | None], before: dict[str, float 
     return " | ".join([*measures, "–" if after["auroc_occluded"] is None else f"{after['auroc_occluded']:.2f}"])
 
 
-def update_readme(readme: Path, name: str, table: str) -> None:
-    """Replace what stands between the two markers of ``name``; ValueError where the markers are missing."""
-    begin, end = f"<!-- {name}: made by `make readme` -->", f"<!-- end of {name} -->"
-    text = readme.read_text()
-    if text.count(begin) != 1 or text.count(end) != 1:
-        raise ValueError(f"{readme} must hold {begin!r} and {end!r} once each")
-    head, rest = text.split(begin)
-    aside = readme.with_suffix(".tmp")
-    aside.write_text(f"{head}{begin}\n{table}\n{end}{rest.split(end)[1]}")
-    os.replace(aside, readme)
+def update_tables(document: Path, results: Path) -> None:
+    """Make every marked table of a Markdown file anew from the folder of results.
 
+    Raises ValueError where the file marks no table, or one that `TABLES` does not have.
+    """
+
+    def fill(marked: re.Match[str]) -> str:
+        if marked["name"] not in TABLES:
+            raise ValueError(f"{document} marks a table {marked['name']!r}, accepted are {', '.join(TABLES)}")
+        file, make = TABLES[marked["name"]]
+        return marked["begin"] + make(json.loads((results / file).read_text())) + marked["end"]
+
+    text, tables = MARKED.subn(fill, document.read_text())
+    if not tables or text.count("made by `make readme`") != tables:
+        raise ValueError(f"{document} must hold at least one table, each between {BEGIN!r} and {END!r}")
+    aside = document.with_suffix(".tmp")
+    aside.write_text(text)
+    os.replace(aside, document)
+
+
+BEGIN, END = "<!-- NAME: made by `make readme` -->", "<!-- end of NAME -->"
+MARKED = re.compile(
+    r"(?P<begin><!-- (?P<name>\w+): made by `make readme` -->\n).*?(?P<end>\n<!-- end of (?P=name) -->)", re.DOTALL
+)
+TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
+    "paper": ("paper/rmse.json", make_results_table),
+    "budget": ("paper/budget.json", make_budget_table),
+    "sigma": ("paper/sigma.json", make_sigma_table),
+    "symmetry": ("paper/symmetry.json", make_symmetry_table),
+    "quick": ("quick/rmse.json", make_results_table),
+    "uncertainty": ("quick/uncertainty.json", make_uncertainty_table),
+}
 
 if __name__ == "__main__":
-    folder, target = Path(sys.argv[1]), Path(sys.argv[2])
-    for part, file, make in (
-        ("paper", "paper/rmse.json", make_results_table),
-        ("budget", "paper/budget.json", make_budget_table),
-        ("sigma", "paper/sigma.json", make_sigma_table),
-        ("symmetry", "paper/symmetry.json", make_symmetry_table),
-        ("results", "quick/rmse.json", make_results_table),
-        ("uncertainty", "quick/uncertainty.json", make_uncertainty_table),
-    ):
-        update_readme(target, part, make(json.loads((folder / file).read_text())))
+    for name in sys.argv[2:]:
+        update_tables(Path(name), Path(sys.argv[1]))

@@ -1,9 +1,12 @@
 """The README's tables say what the results say."""
 
+import json
+import shutil
 from pathlib import Path
 
 import pytest
 
+from mmgsd.config import find_root
 from mmgsd.tables import (
     LABELS,
     make_budget_table,
@@ -11,14 +14,14 @@ from mmgsd.tables import (
     make_sigma_table,
     make_symmetry_table,
     make_uncertainty_table,
-    update_readme,
+    update_tables,
 )
 
 RESULTS = {
     object: {method: {"rmse_mean": 10.0 * i + 1, "median": 5.0, "pck@20px": 0.5} for i, method in enumerate(LABELS)}
     for object in ("cloth", "rope")
 }
-BEGIN, END = "<!-- results: made by `make readme` -->", "<!-- end of results -->"
+BEGIN, END = "<!-- quick: made by `make readme` -->", "<!-- end of quick -->"
 
 
 def test_every_method_has_a_row_with_its_numbers() -> None:
@@ -68,16 +71,39 @@ def test_uncertainty_before_and_after() -> None:
     ]
 
 
-def test_update_replaces_only_what_stands_between_the_markers(tmp_path: Path) -> None:
+@pytest.fixture
+def document(tmp_path: Path) -> Path:
+    (tmp_path / "quick").mkdir()
+    (tmp_path / "quick/rmse.json").write_text(json.dumps(RESULTS))
     path = tmp_path / "README.md"
     path.write_text(f"before\n{BEGIN}\nold\n{END}\nafter\n")
-    update_readme(path, "results", "new")
-    assert path.read_text() == f"before\n{BEGIN}\nnew\n{END}\nafter\n"
+    return path
 
 
-def test_a_readme_without_markers_is_left_alone(tmp_path: Path) -> None:
-    path = tmp_path / "README.md"
-    path.write_text("text")
-    with pytest.raises(ValueError, match="must hold"):
-        update_readme(path, "results", "new")
-    assert path.read_text() == "text"
+def test_update_replaces_only_what_stands_between_the_markers(document: Path) -> None:
+    update_tables(document, document.parent)
+    assert document.read_text() == f"before\n{BEGIN}\n{make_results_table(RESULTS)}\n{END}\nafter\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("text", "at least one table"),
+        (f"{BEGIN}\nnot closed", "each between"),
+        (f"{BEGIN}\n\n{END}".replace("quick", "quack"), "'quack', accepted are paper, budget,"),
+    ],
+)
+def test_a_document_with_wrong_markers_is_left_alone(document: Path, text: str, message: str) -> None:
+    document.write_text(text)
+    with pytest.raises(ValueError, match=message):
+        update_tables(document, document.parent)
+    assert document.read_text() == text
+
+
+@pytest.mark.parametrize("name", ["README.md", "data/results/README.md"])
+def test_the_tables_of_the_committed_documents_can_be_made_anew(name: str, tmp_path: Path) -> None:
+    root = find_root(Path(__file__).parent)
+    copy = Path(shutil.copy(root / name, tmp_path))
+    update_tables(copy, root / "data/results")
+    marked = [[line for line in path.read_text().splitlines() if "<!--" in line] for path in (root / name, copy)]
+    assert marked[0] == marked[1]
