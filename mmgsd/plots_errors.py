@@ -15,6 +15,7 @@ from mmgsd.dataset import Dataset
 from mmgsd.drawing import PAGE_IN, blend_heatmap, check_filled, draw_modes, finish_axes, make_grid, mark_pixel, styled
 from mmgsd.matching import Match
 
+FEW_PAIRS = 5  # of images: their mean says as much of them as of their states
 TRUE = "#00FF6A"  # the sign of true matches
 QUESTIONS = {
     "hidden": ("hidden\nmatches", [0, 1, 2, 3, 4, 5]),
@@ -56,12 +57,15 @@ def summarise_states(described: pd.DataFrame) -> pd.DataFrame:
 
 @styled
 def plot_error_analysis(tables: Mapping[str, pd.DataFrame]) -> Figure:
-    """A row an object ({object: `describe_queries`}): mean RMSE by states, and against what may explain it."""
+    """A row an object ({object: `describe_queries`}): mean RMSE by states, and against what may explain it.
+
+    In brackets where fewer than ``FEW_PAIRS`` pairs of images have these states.
+    """
     check_filled("tables", tables)
     figure, axes = plt.subplots(len(tables), 1 + len(QUESTIONS), figsize=(PAGE_IN, 2.1 * len(tables)), squeeze=False,
                                 layout="constrained", width_ratios=[1.5] + [1] * len(QUESTIONS))  # fmt: skip
     for line, (name, table) in zip(axes, tables.items(), strict=True):
-        _draw_states(line[0], summarise_states(table), name)
+        _draw_states(line[0], table, name)
         for axis, (column, (label, edges)) in zip(line[1:], QUESTIONS.items(), strict=True):
             _draw_bins(axis, table, column, edges if name == "cloth" else LENGTHS.get(column, edges))
             axis.set(xlabel=label, ylim=(0, None))
@@ -69,11 +73,15 @@ def plot_error_analysis(tables: Mapping[str, pd.DataFrame]) -> Figure:
     return finish_axes(figure, keep_box=axes[:, 0].tolist())
 
 
-def _draw_states(axis: Axes, means: pd.DataFrame, name: str) -> None:
+def _draw_states(axis: Axes, table: pd.DataFrame, name: str) -> None:
+    means = summarise_states(table)
+    pairs = table.pivot_table("pair", "state0", "state1", aggfunc="nunique", observed=True).to_numpy()
     axis.imshow(means, cmap="viridis", vmin=0)
     middle = np.nanmax(means) / 2
-    for (row, column), value in np.ndenumerate(means.to_numpy()):
-        axis.text(column, row, f"{value:.0f}", ha="center", va="center", fontsize=6, c="w" if value < middle else "k")
+    for row, column in np.argwhere(pairs > 0):  # NaN where no pair has these states
+        value = means.iloc[row, column]
+        text = f"({value:.0f})" if pairs[row, column] < FEW_PAIRS else f"{value:.0f}"
+        axis.text(column, row, text, ha="center", va="center", fontsize=6, c="w" if value < middle else "k")
     axis.set(xticks=range(means.shape[1]), yticks=range(means.shape[0]), title=f"{name.capitalize()}: RMSE (px)")
     axis.set(ylabel="source", xlabel="target")
     axis.set_xticklabels(means.columns, rotation=40, ha="right")

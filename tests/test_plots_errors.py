@@ -67,11 +67,20 @@ def test_figures_show_every_object_and_query(data: Dataset) -> None:
     assert len(figure.axes) == 5
     bars = [bar.get_height() for bar in figure.axes[1].patches]
     assert bars == [15.0]  # nothing hidden: one bin, the mean of 0, 10, 20 and 30
+    assert [text.get_text() for text in figure.axes[0].texts] == ["(15)"]  # of one pair
     image, mode = np.zeros((SIZE[1], SIZE[0], 3), np.uint8), np.array([[[50.0, 60.0]]])
     match = Match(image, image, np.array([[5.0, 5.0]]), mode, np.ones((1, 1)), np.eye(2)[None, None] * 9,
                   np.zeros(1), np.zeros(1), np.ones((1, 8, 8)) / 64)  # fmt: skip
     figure = plot_worst([match] * 3, [mode[0]] * 3, [1.0, 2.0, 3.0])
     assert [axis.get_title() for axis in figure.axes] == ["1 px", "2 px", "3 px"]
+
+
+def test_states_of_enough_pairs_have_no_brackets_and_absent_ones_no_number(data: Dataset) -> None:
+    described = pd.concat([describe_queries(make_queries([0]), data).assign(pair=k) for k in range(6)])
+    described["state0"], described["state1"] = list("aaaaab"), list("aaaaaa")
+    described.loc[described.state0 == "b", "state1"] = "b"
+    texts = plot_error_analysis({"cloth": described}).axes[0].texts
+    assert [text.get_text() for text in texts] == ["0", "(0)"]
 
 
 def test_nothing_to_draw_is_refused() -> None:
