@@ -40,7 +40,7 @@ def make_parser() -> argparse.ArgumentParser:
     export.add_argument("out", type=Path, help="the file to write, .onnx")
     for command in (match, export):
         command.add_argument("--weights", required=True, metavar="FILE",
-                             help="a trained model (safetensors); or cloth, rope: those in data/weights")  # fmt: skip
+                             help="a trained model (safetensors), or a name in data/weights, like cloth")  # fmt: skip
     return parser
 
 

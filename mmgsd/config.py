@@ -96,8 +96,8 @@ class TrainConfig:
     method: str = "mmgsd"
     group: str = ""  # symmetry group the matches come from; "" is the object's own (c4, c2, or its file's)
     network: str = "lite0"  # or "resnet34", the contrastive papers' reference
-    # what to start from: for lite0 "cloth", "rope" or a file trained here with the same network ("": ImageNet); for
-    # resnet34 a safetensors file of ImageNet weights with torchvision's names ("": random)
+    # what to start from: for lite0 a name in data/weights, or a file trained here with the same network ("": ImageNet);
+    # for resnet34 a safetensors file of ImageNet weights with torchvision's names ("": random)
     trunk_weights: str = ""
     descriptor_dim: int = 32
     roles: int = 1  # 2: a pixel that is asked about and one that answers have descriptors of their own

@@ -15,7 +15,7 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from mmgsd.config import OBJECTS, TrainConfig, find_root, from_dict
+from mmgsd.config import TrainConfig, find_root, from_dict
 from mmgsd.losses import CONTRASTIVE, compute_squared_distances
 from mmgsd.mixture import Mixture, fit_modes
 from mmgsd.network import (
@@ -219,14 +219,16 @@ class Pair:
 
 
 def load(weights: Path | str, *, device: str = "") -> Matcher:
-    """A `Matcher` with the weights of a file, or those that ``data/weights`` holds for ``"cloth"`` or ``"rope"``.
+    """A `Matcher` with the weights of a file, or of a name that ``data/weights`` holds: ``"cloth"``, ``"rope-spcl"``.
 
     FileNotFoundError where there are none; ValueError for a file that is damaged or not ours.
     """
-    if str(weights) in OBJECTS:
-        weights = find_root() / "data" / "weights" / f"{weights}.safetensors"
-    elif not Path(weights).is_file():
-        raise FileNotFoundError(f"{weights} must be a safetensors file or one of {', '.join(map(repr, OBJECTS))}")
+    if not Path(weights).is_file():
+        folder = find_root() / "data" / "weights"
+        names = sorted(path.stem for path in folder.glob("*.safetensors"))
+        if str(weights) not in names:
+            raise FileNotFoundError(f"{weights} must be a safetensors file or one of {', '.join(map(repr, names))}")
+        weights = folder / f"{weights}.safetensors"
     return Matcher.load(weights, device=device)
 
 

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from mmgsd.config import TrainConfig
+from mmgsd.config import TrainConfig, find_root
 from mmgsd.dataset import load_dataset
-from mmgsd.matching import Matcher
+from mmgsd.matching import Matcher, load
 from mmgsd.shipping import restore_model, ship_model
 from mmgsd.training import train_model
 
+CARDS = sorted((find_root(Path(__file__).parent) / "data" / "weights").glob("*.md"))
 FACTS = {"preset": "smoke", "data_seed": 7, "rmse_mean": 12.34, "median": 10.0, "queries": 1234}
 
 
@@ -41,3 +43,9 @@ def test_half_precision_gives_the_same_answers(tiny_dataset: Callable[..., Path]
     assert restore_model(shipped, weights.parent, config).read_bytes() != shipped.read_bytes()  # trained here: kept
     with pytest.raises(ValueError, match="train that one"):
         restore_model(shipped, tmp_path / "other", dataclasses.replace(config, seed=1))
+
+
+@pytest.mark.parametrize("card", CARDS, ids=[card.stem for card in CARDS])
+def test_what_is_shipped_loads_by_the_name_that_its_card_gives(card: Path) -> None:
+    (name,) = re.findall(r'mmgsd\.load\("(.+)"\)', card.read_text())
+    assert load(name).config.name == load(card.with_suffix(".safetensors")).config.name
