@@ -198,10 +198,12 @@ class Preset:
         """The same models at the smaller budget of the studies."""
         return dataclasses.replace(self, train=self.ablation).main_table(object)
 
-    def sigma_table(self, object: str, sigmas_px: Sequence[float] = ()) -> dict[str, TrainConfig]:
-        """MMGSD at that budget with each σ, of the preset where ``sigmas_px`` names none: {"4": …}."""
+    def sigma_table(self, object: str, sigmas_px: Sequence[float] = (), *, steps: int = 0) -> dict[str, TrainConfig]:
+        """MMGSD with each σ, of the preset where ``sigmas_px`` names none: {"4": …}; 0 ``steps`` are that budget's."""
         chosen = sorted({float(sigma) for sigma in sigmas_px or self.sigmas_px})
-        return {f"{sigma:g}": dataclasses.replace(self.ablation[object], sigma_px=sigma) for sigma in chosen}
+        budget = self.ablation[object]
+        models = {sigma: dataclasses.replace(budget, sigma_px=sigma, steps=steps or budget.steps) for sigma in chosen}
+        return {f"{sigma:g}": model for sigma, model in models.items()}
 
 
 def _preset(

@@ -113,12 +113,15 @@ def write_main_table(preset: Preset, root: Path) -> None:
     write_results(tables, paths.results / "rmse.json")
 
 
-def write_sigma_table(preset: Preset, root: Path, sigmas_px: Sequence[float] = ()) -> None:
-    """Write sigma.json, by the rule of `write_tables`; ``sigmas_px`` besides the preset's and those that are there."""
-    paths = Paths(root, preset.name)
-    there = [float(sigma) for rows in _read(paths.results / "sigma.json").values() for sigma in rows]
-    models = {name: preset.sigma_table(name, [*preset.sigmas_px, *sigmas_px, *there]) for name in OBJECTS}
-    _write_study(models, paths, "sigma")
+def write_sigma_table(preset: Preset, root: Path, sigmas_px: Sequence[float] = (), *, steps: int = 0) -> None:
+    """Write sigma.json, by the rule of `write_tables`; ``sigmas_px`` besides the preset's and those that are there.
+
+    The models of other ``steps`` than the smaller budget's have a file of their own: sigma_4000.json.
+    """
+    paths, study = Paths(root, preset.name), f"sigma_{steps}" if steps else "sigma"
+    there = [float(sigma) for rows in _read(paths.results / f"{study}.json").values() for sigma in rows]
+    chosen = [*preset.sigmas_px, *sigmas_px, *there]
+    _write_study({name: preset.sigma_table(name, chosen, steps=steps) for name in OBJECTS}, paths, study)
 
 
 def _write_study(models: dict[str, dict[str, TrainConfig]], paths: Paths, study: str) -> None:

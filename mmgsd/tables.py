@@ -120,6 +120,7 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "paper": ("paper/rmse.json", make_results_table),
     "budget": ("paper/budget.json", make_budget_table),
     "sigma": ("paper/sigma.json", make_sigma_table),
+    "sigma_4000": ("paper/sigma_4000.json", make_sigma_table),
     "symmetry": ("paper/symmetry.json", make_symmetry_table),
     "quick": ("quick/rmse.json", make_results_table),
     "uncertainty": ("quick/uncertainty.json", make_uncertainty_table),

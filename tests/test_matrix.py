@@ -13,7 +13,7 @@ from dask.distributed import LocalCluster
 from mmgsd import matrix
 from mmgsd.config import Preset, load_preset
 from mmgsd.evaluation import write_results
-from mmgsd.matrix import list_models, list_tasks, run_tasks, write_tables
+from mmgsd.matrix import list_models, list_tasks, run_tasks, write_sigma_table, write_tables
 
 SMOKE = load_preset("smoke")
 
@@ -67,6 +67,9 @@ def test_results_are_written_of_what_is_done(tiny_dataset: Callable[..., Path], 
     assert budget["cloth"]["pcl"]["rmse_mean"] == pytest.approx(of_pcl, abs=1e-3)
     assert sigma.keys() == {"cloth"} and sigma["cloth"].keys() == {"3"}
     assert sigma["cloth"]["3"]["rmse_mean"] == pytest.approx(of_sigma, abs=1e-3)
+    write_sigma_table(preset, tmp_path, [3], steps=1)  # the same models: what the smaller budget has anyway
+    write_sigma_table(preset, tmp_path, [3], steps=2)
+    assert json.loads((results / "sigma_1.json").read_text()) == sigma and not (results / "sigma_2.json").exists()
     for file in (tmp_path / "data" / "generated" / "smoke" / "queries").iterdir():  # as on another machine
         file.unlink()
     kept = read_results(preset, tmp_path)
