@@ -123,7 +123,7 @@ def compute_loss(
         valid = valid & batch.askable[pair[1][:, None, None], orbit]  # as in Dense Object Nets: seen in both images
         there = sampled[pair[1][:, None, None], orbit, -config.descriptor_dim :]  # (K, Q, G, D)
         match = (source[:, :, None] - there).square().sum(-1)
-        far, apart = _sample_non_matches(config, target, batch, pair, source, modes, (xs, ys), generator)
+        far, apart = _sample_non_matches(config, target, batch, pair, source, modes, size, generator)
         function = losses.pcl if config.method == "pcl" else losses.spcl
         return function((match + 1e-12).sqrt(), valid, (far + 1e-12).sqrt(), apart, margin=config.margin)
     wanted = losses.compute_target(modes, valid, xs, ys, compute_sigma(config, step))
@@ -347,9 +347,13 @@ def _sample_batch_pairs(images: int, pairs: int, generator: torch.Generator, dev
 
 def _sample_non_matches(
     config: TrainConfig, target: Tensor, batch: Batch, pair: Tensor, source: Tensor, modes: Tensor,
-    cells: tuple[Tensor, Tensor], generator: torch.Generator,
+    size: tuple[int, int], generator: torch.Generator,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Squared distances (K, Q, N) to random cells, half on the object and half off it, and which are no match."""
+    """Squared distances (K, Q, N) to random places, half on the object and half off it, and which are no match.
+
+    Places, not the centres of cells: a match lies between cells, and an interpolated descriptor is the mean of four,
+    nearer to any other. Were only the matches interpolated, a network would learn that instead: a chequered grid.
+    """
     (k, q, _), (height, width) = source.shape, target.shape[-2:]
     on_object = F.adaptive_avg_pool2d(batch.mask.float()[:, None], (height, width))[pair[1], 0].flatten(1)  # (K, C)
     half = config.non_matches // 2
@@ -358,9 +362,11 @@ def _sample_non_matches(
         for weight, count in ((on_object, half), (1 - on_object, config.non_matches - half))
     ]
     cell = torch.cat(drawn, -1)  # (K, Q, N)
-    flat = target[pair[1]].flatten(2).mT  # (K, C, D)
-    picked = flat[torch.arange(k, device=cell.device)[:, None, None], cell]  # (K, Q, N, D)
-    xs, ys = cells
-    position = torch.stack([xs[cell % width], ys[cell // width]], -1)  # (K, Q, N, 2)
+    corner = torch.stack([cell % width, cell // width], -1)  # (K, Q, N, 2)
+    cells = torch.tensor([width, height], device=cell.device)
+    pixels = torch.tensor(size, device=cell.device) / cells  # of a cell
+    within = torch.rand(corner.shape, generator=generator, device=cell.device)
+    position = (corner + within) * pixels - 0.5  # (K, Q, N, 2)
+    picked = sample_descriptors(target[pair[1]], position.flatten(1, 2), size).view(k, q, -1, config.descriptor_dim)
     gap = (position[:, :, :, None] - modes[:, :, None]).square().sum(-1).amin(-1)  # (K, Q, N)
-    return (picked - source[:, :, None]).square().sum(-1), gap > (1.5 * float(xs[1] - xs[0])) ** 2
+    return (picked - source[:, :, None]).square().sum(-1), gap > (1.5 * float(pixels[0])) ** 2

@@ -230,6 +230,22 @@ def test_roles_with_equal_descriptors_are_one_role(cloth_dataset: Path, method: 
     assert two.grad[:, :8].any() and two.grad[:, 8:].any()
 
 
+@pytest.mark.parametrize("method", ["pcl", "spcl"])
+def test_noise_tells_no_match_from_a_non_match(
+    cloth_dataset: Path, method: str, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else a network learns how the two are sampled, not what they show: the shortest way to a small loss."""
+    distances = []
+    monkeypatch.setattr(training.losses, method, lambda *both, margin: distances.append(both) or torch.zeros(()))
+    data = load_dataset(cloth_dataset)
+    config = dataclasses.replace(TINY, method=method, queries=256)
+    batch = make_batch(load_training_images(data, 64), np.arange(4), config, rng, torch.device("cpu"))
+    noise = torch.randn(4, 8, 16, 16, generator=torch.Generator().manual_seed(0))
+    compute_loss(config, noise, batch, torch.tensor(data.group("c4").permutations), data.size, 0)
+    [(match, valid, far, apart)] = distances
+    assert match[valid].mean().item() == pytest.approx(far[apart].mean().item(), rel=0.03)
+
+
 def test_hidden_points_are_not_asked(tiny_dataset: Callable[..., Path], rng: np.random.Generator) -> None:
     images = load_training_images(load_dataset(tiny_dataset(object="rope")), 64)
     config = dataclasses.replace(TINY, object="rope", group="c2", augment=False)
