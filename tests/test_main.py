@@ -78,7 +78,7 @@ def test_the_picture_is_drawn(weights, images, capsys, tmp_path, pixels):
         ({"xy": "a,b"}, 2, "must be two numbers such as 212,148, got 'a,b'"),
         ({"xy": "9000,3"}, 1, "xy must be finite and inside image0 of 300 x 200 px"),
         ({"--n": "0"}, 2, "must be a number from 1 on, or auto, got '0'"),
-        ({"--weights": "towel"}, 1, "towel must be a safetensors file or one of 'cloth', 'cloth-spcl', "),
+        ({"--weights": "towel"}, 1, "towel must be a safetensors file or one of 'cloth', "),
         ({"--out": "match.txt"}, 2, "argument --out: must end with .png"),
         ({"image1": "nowhere.png"}, 1, "nowhere.png"),
         ({"image1": __file__}, 1, "is no image that can be read"),
