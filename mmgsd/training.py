@@ -118,7 +118,6 @@ def compute_loss(
     source = sampled[pair[0][:, None], points, : config.descriptor_dim]  # (K, Q, D)
     modes = batch.xy[pair[1][:, None, None], orbit]  # (K, Q, G, 2)
     valid = batch.inside[pair[1][:, None, None], orbit] & batch.askable[pair[0][:, None], points][..., None]
-    xs, ys = (c.to(descriptors.device) for c in compute_cell_centres(size, descriptors.shape[-2:]))
     if config.method in CONTRASTIVE:
         valid = valid & batch.askable[pair[1][:, None, None], orbit]  # as in Dense Object Nets: seen in both images
         there = sampled[pair[1][:, None, None], orbit, -config.descriptor_dim :]  # (K, Q, G, D)
@@ -126,6 +125,7 @@ def compute_loss(
         far, apart = _sample_non_matches(config, target, batch, pair, source, modes, size, generator)
         function = losses.pcl if config.method == "pcl" else losses.spcl
         return function((match + 1e-12).sqrt(), valid, (far + 1e-12).sqrt(), apart, margin=config.margin)
+    xs, ys = (c.to(descriptors.device) for c in compute_cell_centres(size, descriptors.shape[-2:]))
     wanted = losses.compute_target(modes, valid, xs, ys, compute_sigma(config, step))
     squared = losses.compute_squared_distances(source, target[pair[1]].flatten(2).mT)
     return losses.mmgsd(squared, wanted)
