@@ -9,6 +9,7 @@ import pytest
 
 from mmgsd import config as config_module
 from mmgsd.config import (
+    CONTRASTIVE_MARGIN,
     METHODS,
     OBJECTS,
     EvaluateConfig,
@@ -47,9 +48,11 @@ def test_paper_preset_has_the_papers_sizes() -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_methods_of_a_preset_differ_in_nothing_else(method: str) -> None:
+def test_methods_of_a_preset_differ_in_the_loss_alone(method: str) -> None:
     preset = load_preset("quick")
-    assert dataclasses.replace(preset.method("cloth", method), method="mmgsd") == preset.train["cloth"]
+    model, mmgsd = preset.method("cloth", method), preset.train["cloth"]
+    assert dataclasses.replace(model, method="mmgsd", margin=mmgsd.margin) == mmgsd
+    assert (model.margin == CONTRASTIVE_MARGIN) == (method in ("pcl", "spcl"))
 
 
 def test_unknown_preset_names_the_accepted_ones() -> None:
