@@ -19,6 +19,8 @@ from typing import Any, TypeVar
 
 OBJECTS = ("cloth", "rope")
 METHODS = ("pcl", "spcl", "unimodal", "mmgsd")
+CONTRASTIVE = ("pcl", "spcl")  # the others are distributional
+MATCHES_OF_ONE = ("pcl", "unimodal")  # methods that are taught the identity only
 IMAGE_SIZE = {"cloth": (485, 485), "rope": (640, 480)}  # (width, height) px, paper section "Quantitative Results"
 DEFAULT_GROUP = {"cloth": "c4", "rope": "c2"}
 OWN_GROUP = "own"  # of any other object: what its file says
@@ -149,12 +151,12 @@ class TrainConfig:
     @property
     def dense_weight(self) -> float:
         """Weight of the dense supervision that the method gets."""
-        return float(self.method in ("unimodal", "mmgsd")) if self.prototype_weight < 0 else self.prototype_weight
+        return float(self.method not in CONTRASTIVE) if self.prototype_weight < 0 else self.prototype_weight
 
     @property
     def name(self) -> str:
         """Folder name: what a reader looks for, and a digest of everything else."""
-        kind = f"sigma{self.sigma_px:g}" if self.method in ("unimodal", "mmgsd") else CONTRASTIVE_REVISION
+        kind = CONTRASTIVE_REVISION if self.method in CONTRASTIVE else f"sigma{self.sigma_px:g}"
         return f"{self.object}-{self.method}-{self.group}-{kind}-{digest(self)}"
 
 
@@ -187,7 +189,7 @@ class Preset:
     def method(self, object: str, method: str) -> TrainConfig:
         """The training configuration of one method on one object; they differ in the loss and its margin alone."""
         train = self.train[object]
-        margin = CONTRASTIVE_MARGIN if method in ("pcl", "spcl") else train.margin
+        margin = CONTRASTIVE_MARGIN if method in CONTRASTIVE else train.margin
         return dataclasses.replace(train, method=method, margin=margin)
 
     def main_table(self, object: str) -> dict[str, TrainConfig]:

@@ -11,9 +11,6 @@ import math
 import torch
 from torch import Tensor
 
-CONTRASTIVE = ("pcl", "spcl")
-MATCHES_OF_ONE = ("pcl", "unimodal")  # methods that are taught the identity only
-
 
 def compute_squared_distances(source: Tensor, target: Tensor) -> Tensor:
     """Squared Euclidean distances of (K, Q, D) and (K, C, D) descriptors as (K, Q, C), never negative."""

@@ -24,10 +24,9 @@ from tqdm.auto import tqdm
 
 from mmgsd import distributed, losses
 from mmgsd.augmentation import Batch, load_training_images, make_batch
-from mmgsd.config import TrainConfig, from_dict
+from mmgsd.config import CONTRASTIVE, MATCHES_OF_ONE, TrainConfig, from_dict
 from mmgsd.dataset import Dataset, hold_out, load_dataset
 from mmgsd.evaluation import calibrate_bandwidth, calibrate_temperature, measure_rmse
-from mmgsd.losses import CONTRASTIVE, MATCHES_OF_ONE
 from mmgsd.matching import Matcher, load
 from mmgsd.network import (
     build_network,
