@@ -219,7 +219,7 @@ class Pair:
 
 
 def load(weights: Path | str, *, device: str = "") -> Matcher:
-    """A `Matcher` with the weights of a file, or of a name that ``data/weights`` holds: ``"cloth"``, ``"rope"``.
+    """A `Matcher` with the weights of a file, or of a name that ``data/weights`` holds: ``"cloth"``, ``"rope-spcl"``.
 
     FileNotFoundError where there are none; ValueError for a file that is damaged or not ours.
     """
