@@ -1,4 +1,4 @@
-"""What the paper's figures are drawn from, small enough to be kept with the results: all errors, and one example."""
+"""What the paper's figures are drawn from, small enough to be kept with the results: errors summed up, an example."""
 
 from __future__ import annotations
 
@@ -16,10 +16,11 @@ from safetensors.numpy import save_file
 
 from mmgsd.dataset import Dataset
 from mmgsd.matching import Match, Matcher
+from mmgsd.metrics import ErrorSummary, summarise_errors
 from mmgsd.plots import compute_object_size
 
-STEP_PX = 1 / 8  # to which errors are rounded; kept as 16-bit integers
 QUALITY = 90  # of the example's images, JPEG
+_SUMMARY = ("mean_px", "histogram")  # and asked, which all methods share
 _ANSWER = ("modes", "weights", "covariances", "entropy", "outside", "cells")
 
 
@@ -27,7 +28,7 @@ _ANSWER = ("modes", "weights", "covariances", "entropy", "outside", "cells")
 class FigureData:
     """One object's part of the paper's figures."""
 
-    errors: dict[str, pd.DataFrame]  # {method: a row a query with point, visible, rmse_px}
+    errors: dict[str, ErrorSummary]  # {method: its errors}
     object_size_px: float  # diagonal of the bounding box, mean over the test images
     answers: dict[str, Match]  # {method: its answers about the example}
     true: np.ndarray  # (n, 2) px, the matches of the example's first query
@@ -52,22 +53,22 @@ def gather_figure_data(
     first, second = choose_example(queries["mmgsd"], points)
     images, xy = (data.load_image(first), data.load_image(second)), data.xy[first, points]
     answers = {method: Matcher.load(path).match(*images, xy) for method, path in weights.items()}
-    errors = {method: table[["point", "visible", "rmse_px"]] for method, table in queries.items()}
+    errors = {method: summarise_errors(table) for method, table in queries.items()}
     size = compute_object_size([data.load_mask(i) for i in range(len(data))])
     return FigureData(errors, size, answers, data.xy[second][data.group().distinct_modes(points[0])])
 
 
 def save_figure_data(data: FigureData, path: Path) -> Path:
-    """Write a safetensors file; errors to an eighth of a pixel, all methods having answered the same queries."""
-    asked, example = next(iter(data.errors.values())), next(iter(data.answers.values()))
-    tensors = {"point": asked.point.to_numpy(np.uint16), "visible": asked.visible.to_numpy(), "true": data.true}
+    """Write a safetensors file; ValueError where the methods did not answer the same queries."""
+    asked, example = next(iter(data.errors.values())).asked, next(iter(data.answers.values()))
+    tensors = {"asked": asked, "true": data.true}
     for name in ("image0", "image1"):
         image = cv2.cvtColor(getattr(example, name), cv2.COLOR_RGB2BGR)
         tensors[name] = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1]
-    for method, table in data.errors.items():
-        if not table[["point", "visible"]].equals(asked[["point", "visible"]]):
+    for method, summary in data.errors.items():
+        if not np.array_equal(summary.asked, asked):
             raise ValueError(f"errors[{method!r}] must answer the same queries as the other methods")
-        tensors[f"errors/{method}"] = (table.rmse_px / STEP_PX).round().clip(0, 65535).to_numpy(np.uint16)
+        tensors |= {f"errors/{method}/{name}": getattr(summary, name) for name in _SUMMARY}
     tensors["xy"] = example.xy
     for method, match in data.answers.items():
         tensors |= {f"{method}/{name}": np.asarray(getattr(match, name), np.float32) for name in _ANSWER}
@@ -87,10 +88,10 @@ def load_figure_data(path: Path) -> FigureData:
         with safe_open(path, "np") as file:
             note = json.loads(file.metadata()["figures"])
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        summaries = {m: [tensors[f"errors/{m}/{name}"] for name in _SUMMARY] for m in note["methods"]}
+        errors = {m: ErrorSummary(tensors["asked"], *summary) for m, summary in summaries.items()}
     except (SafetensorError, KeyError, TypeError) as error:
         raise ValueError(f"{path} does not hold the data of figures: {error}") from error
-    asked = pd.DataFrame({"point": tensors["point"].astype(int), "visible": tensors["visible"]})
-    errors = {m: asked.assign(rmse_px=tensors[f"errors/{m}"] * STEP_PX) for m in note["methods"]}
     images = (cv2.cvtColor(cv2.imdecode(tensors[n], cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB) for n in ("image0", "image1"))
     shared = dict(zip(("image0", "image1"), images, strict=True), xy=tensors["xy"])
     answers = {m: Match(**shared, **{n: tensors[f"{m}/{n}"] for n in _ANSWER}) for m in note["models"]}

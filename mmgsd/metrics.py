@@ -2,13 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import permutations
 
 import numpy as np
 import pandas as pd
 from scipy.optimize import linear_sum_assignment
 
+from mmgsd.config import N_POINTS
+
 PCK_PX = (5, 10, 20)
+BIN_PX = 0.5  # width of the bins of an error's histogram
+
+
+@dataclass(frozen=True)
+class ErrorSummary:
+    """A method's ``rmse_px`` over the queries with a visible source: by material point, and their distribution."""
+
+    asked: np.ndarray  # (625,) queries of each material point
+    mean_px: np.ndarray  # (625,) mean error of each, NaN where none was asked
+    histogram: np.ndarray  # (K,) errors in each bin of BIN_PX from 0
 
 
 def assign_modes(modes: np.ndarray, true: np.ndarray) -> np.ndarray:
@@ -89,3 +102,18 @@ def aggregate(queries: pd.DataFrame) -> dict[str, float]:
         **{f"pck@{t}px": queries[f"pck@{t}px"].mean() for t in PCK_PX},
     }
     return {name: round(float(value), 4) for name, value in summary.items()} | {"queries": len(queries)}
+
+
+def summarise_errors(queries: pd.DataFrame) -> ErrorSummary:
+    """Summary of a table of queries, of which it reads ``point``, ``visible`` and ``rmse_px``."""
+    seen = queries[queries.visible]
+    bins = (seen.rmse_px.to_numpy(float) // BIN_PX).astype(int)
+    by_point = seen.groupby("point").rmse_px
+    asked = by_point.size().reindex(range(N_POINTS), fill_value=0).to_numpy()
+    return ErrorSummary(asked, compute_point_errors(queries), np.bincount(bins))
+
+
+def compute_point_errors(queries: pd.DataFrame) -> np.ndarray:
+    """(625,) mean ``rmse_px`` of each material point as a visible source, NaN where it never was one."""
+    mean = queries[queries.visible].groupby("point").rmse_px.mean()
+    return mean.reindex(range(N_POINTS)).to_numpy(float)

@@ -34,9 +34,10 @@ from mmgsd.drawing import (
     styled,
 )
 from mmgsd.matching import Match
+from mmgsd.metrics import BIN_PX, ErrorSummary
 
 _ORBIT_COLOURS = ("#D55E00", "#56B4E9", "#FFE100", "#009E73")
-DENSITY_STEP, SEGMENTS = 0.25, 25  # % of the object's size between points of a density; segments of a rope
+SEGMENTS = 25  # of a rope
 
 
 @styled
@@ -105,22 +106,23 @@ def plot_combined(
 
 
 @styled
-def plot_rmse_pdf(tables: Mapping[str, Mapping[str, pd.DataFrame]], object_sizes_px: Mapping[str, float]) -> Figure:
+def plot_rmse_pdf(errors: Mapping[str, Mapping[str, ErrorSummary]], object_sizes_px: Mapping[str, float]) -> Figure:
     """Probability density of the error of a query with a visible source, as a percentage of the object's size.
 
-    ``tables`` {object: {method: queries}}, a panel an object, a line a method, chance dashed. The object's size is the
+    ``errors`` {object: {method: summary}}, a panel an object, a line a method, chance dashed. The object's size is the
     diagonal of its bounding box, mean over the test images (``compute_object_size``). Smoothed with a std of 1 %.
     """
-    for name, methods in {"": tables, **tables}.items():
-        check_filled(f"tables[{name!r}]" if name else "tables", methods)
-    figure, axes = plt.subplots(len(tables), 1, figsize=(COLUMN_IN, 0.4 + 1.4 * len(tables)), layout="constrained",
+    for name, methods in {"": errors, **errors}.items():
+        check_filled(f"errors[{name!r}]" if name else "errors", methods)
+    figure, axes = plt.subplots(len(errors), 1, figsize=(COLUMN_IN, 0.4 + 1.4 * len(errors)), layout="constrained",
                                 sharex=True, squeeze=False)  # fmt: skip
     far = 0.0
-    for axis, (name, methods) in zip(axes[:, 0], tables.items(), strict=True):
-        for method, queries in methods.items():
-            percent = 100 * queries.rmse_px[queries.visible].to_numpy() / object_sizes_px[name]
-            axis.plot(*compute_density(percent), **get_line_style(method))
-            far = max(far, float(np.quantile(percent, 0.99)))
+    for axis, (name, methods) in zip(axes[:, 0], errors.items(), strict=True):
+        step = 100 * BIN_PX / object_sizes_px[name]  # %
+        for method, summary in methods.items():
+            axis.plot(*compute_density(summary.histogram, step), **get_line_style(method))
+            cumulated = np.cumsum(summary.histogram)
+            far = max(far, step * (1 + int(np.searchsorted(cumulated, 0.99 * cumulated[-1]))))
         axis.set(title=name.capitalize(), ylabel="Density per %", ylim=(0, None))
     axes[-1, 0].set(xlabel="Error (% of the object's bounding-box diagonal)", xlim=(0, far))
     add_legend(figure, axes[:, 0])
@@ -129,25 +131,24 @@ def plot_rmse_pdf(tables: Mapping[str, Mapping[str, pd.DataFrame]], object_sizes
 
 @styled
 def plot_spatial_rmse(
-    tables: Mapping[str, Mapping[str, pd.DataFrame]], *, mapped: Sequence[str] = ("mmgsd", "spcl")
+    errors: Mapping[str, Mapping[str, ErrorSummary]], *, mapped: Sequence[str] = ("mmgsd", "spcl")
 ) -> Figure:
     """Mean error over the rope's length for every method (1-D), and over the cloth's area for those ``mapped`` (2-D).
 
-    ``tables`` {"rope", "cloth": {method: queries}}; the maps, of the ``mapped`` that are in it, share one scale, points
+    ``errors`` {"rope", "cloth": {method: summary}}; the maps, of the ``mapped`` that are in it, share one scale, points
     never asked stay grey.
     """
     for name in ("rope", "cloth"):
-        check_filled(f"tables[{name!r}]", tables.get(name, {}))
-    mapped = [method for method in mapped if method in tables["cloth"]]
+        check_filled(f"errors[{name!r}]", errors.get(name, {}))
+    mapped = [method for method in mapped if method in errors["cloth"]]
     figure, axes = plt.subplots(1, 1 + len(mapped), figsize=(PAGE_IN, 2.1), layout="constrained",
                                 width_ratios=[2.0] + [1.0] * len(mapped))  # fmt: skip
-    for method, queries in tables["rope"].items():
-        errors = compute_point_errors(queries)
-        seen = np.flatnonzero(np.isfinite(errors))
-        mean = pd.Series(errors[seen]).groupby(seen * SEGMENTS // N_POINTS).mean()
+    for method, summary in errors["rope"].items():
+        seen = np.flatnonzero(summary.asked)
+        mean = pd.Series(summary.mean_px[seen]).groupby(seen * SEGMENTS // N_POINTS).mean()
         axes[0].plot((mean.index + 0.5) * 100 / SEGMENTS, mean, **get_line_style(method))
     axes[0].set(title="Rope", xlabel="Position along the rope (%)", ylabel="RMSE (px)", xlim=(0, 100), ylim=(0, None))
-    maps = [compute_point_errors(tables["cloth"][method]).reshape(25, 25) for method in mapped]
+    maps = [errors["cloth"][method].mean_px.reshape(25, 25) for method in mapped]
     for axis, method, values in zip(axes[1:], mapped, maps, strict=True):
         image = axis.imshow(values, cmap=colormaps["viridis"].with_extremes(bad="0.85"), vmin=0, vmax=np.nanmax(maps))
         axis.set(title=f"Cloth · {METHOD_LABELS[method]}", xticks=[0, 12, 24], yticks=[0, 12, 24])
@@ -301,18 +302,15 @@ def compute_object_size(masks: Sequence[np.ndarray]) -> float:
     return float(np.linalg.norm(spans, axis=1).mean())
 
 
-def compute_density(percent: np.ndarray, *, bandwidth: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-    """Centres (K,) and density (K,) of (N,) errors ≥ 0: a histogram smoothed by a Gaussian, mirrored at zero."""
-    check_filled("percent", percent)
-    edges = np.arange(0, percent.max() + 5 * bandwidth + DENSITY_STEP, DENSITY_STEP)
-    share = np.histogram(percent, edges)[0] / (len(percent) * DENSITY_STEP)
-    return edges[:-1] + DENSITY_STEP / 2, gaussian_filter1d(share, bandwidth / DENSITY_STEP, mode="reflect")
+def compute_density(histogram: np.ndarray, step: float, *, bandwidth: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    """Centres (K,) and density (K,) of a histogram of values ≥ 0 in bins of width ``step``.
 
-
-def compute_point_errors(queries: pd.DataFrame) -> np.ndarray:
-    """(625,) mean ``rmse_px`` of each material point as a visible source, NaN where it never was one."""
-    mean = queries[queries.visible].groupby("point").rmse_px.mean()
-    return mean.reindex(range(N_POINTS)).to_numpy(float)
+    It is smoothed by a Gaussian, mirrored at zero. ValueError where the histogram counts nothing.
+    """
+    check_filled("histogram", histogram[histogram > 0])
+    padded = np.pad(histogram, (0, int(np.ceil(5 * bandwidth / step))))
+    density = gaussian_filter1d(padded / (padded.sum() * step), bandwidth / step, mode="reflect")
+    return (np.arange(len(padded)) + 0.5) * step, density
 
 
 def _draw_comparison(line: Sequence[Axes], methods: Mapping[str, Match], true: np.ndarray, sigma_px: float) -> None:

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from mmgsd.config import N_POINTS
 from mmgsd.drawing import PAGE_IN, check_filled, finish_axes, styled
-from mmgsd.plots import compute_point_errors
+from mmgsd.metrics import compute_point_errors
 
 SIDE = round(N_POINTS**0.5)
 CORNER, BORDER, INTERIOR = 5, 3, 13  # points: side of a corner's block, width of the edge, side of the interior

@@ -16,6 +16,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from mmgsd import report_tables as tables
 from mmgsd.claims import list_claims
 from mmgsd.config import IMAGE_SIZE, N_POINTS, OBJECTS, Paths, find_root, load_preset
@@ -53,14 +55,14 @@ def measure_places(path: Path, name: str) -> dict[str, float]:
     from mmgsd.figure_data import load_figure_data  # with torch: only where it is needed
     from mmgsd.plots_symmetry import find_regions
 
-    queries = load_figure_data(path).errors["mmgsd"]
-    seen = queries[queries.visible]
+    errors = load_figure_data(path).errors["mmgsd"]
     if name == "cloth":
-        places = {region: points[seen.point] for region, points in find_regions().items()}
+        places = find_regions()
     else:
-        from_middle = (seen.point / (N_POINTS - 1) - 0.5).abs()
+        from_middle = np.abs(np.arange(N_POINTS) / (N_POINTS - 1) - 0.5)
         places = {"end": from_middle > 0.5 - ENDS, "middle": from_middle < ENDS}
-    return {place: float(seen.rmse_px[chosen].mean()) for place, chosen in places.items() if chosen.any()}
+    mean, asked = np.nan_to_num(errors.mean_px), errors.asked
+    return {place: float(np.average(mean[p], weights=asked[p])) for place, p in places.items() if asked[p].any()}
 
 
 def flatten(tree: Mapping[str, Any] | Sequence[Any], prefix: str = "") -> dict[str, str]:

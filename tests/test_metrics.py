@@ -12,11 +12,13 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from mmgsd.metrics import (
+    BIN_PX,
     aggregate,
     compute_mahalanobis2,
     compute_mode_errors,
     compute_query_errors,
     compute_swaps,
+    summarise_errors,
 )
 
 TRUE = np.array([[[0.0, 0.0], [100.0, 0.0]]])
@@ -139,3 +141,19 @@ def test_aggregate_by_hand() -> None:
         "best_mean": 1.0, "swap_rate": 0.5,
         "pck@5px": 0.5, "pck@10px": 1.0, "pck@20px": 1.0, "queries": 3,
     }  # fmt: skip
+
+
+def test_a_summary_counts_visible_sources_alone() -> None:
+    point, visible = [3, 3, 3, 600], [True, True, False, True]
+    errors = [0.2, 2 * BIN_PX, 1e6, 2.5 * BIN_PX]
+    summary = summarise_errors(pd.DataFrame({"point": point, "visible": visible, "rmse_px": errors}))
+    assert summary.histogram.tolist() == [1, 0, 2]
+    assert {int(p): int(n) for p, n in enumerate(summary.asked) if n} == {3: 2, 600: 1}
+    assert summary.mean_px[[3, 600]].tolist() == pytest.approx([(0.2 + 2 * BIN_PX) / 2, 2.5 * BIN_PX])
+    assert np.flatnonzero(np.isfinite(summary.mean_px)).tolist() == [3, 600] and summary.asked.shape == (625,)
+
+
+def test_a_summary_of_nothing_seen_counts_nothing() -> None:
+    hidden = pd.DataFrame({"point": [3], "visible": [False], "rmse_px": [1.0]})
+    summary = summarise_errors(hidden)
+    assert summary.asked.sum() == summary.histogram.sum() == 0 and np.isnan(summary.mean_px).all()

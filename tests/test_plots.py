@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 
 from mmgsd import drawing, plots
 from mmgsd.matching import Match
+from mmgsd.metrics import BIN_PX, ErrorSummary, summarise_errors
 
 
 def make_match(queries: int = 1, modes: int = 2, *, height: int = 40, width: int = 60) -> Match:
@@ -31,9 +32,9 @@ def make_queries(error: float = 20.0, points: int = 625) -> pd.DataFrame:
     return pd.DataFrame({"point": point, "visible": visible, "rmse_px": rmse})
 
 
-def make_tables(points: int = 625) -> dict[str, dict[str, pd.DataFrame]]:
+def make_errors(points: int = 625) -> dict[str, dict[str, ErrorSummary]]:
     errors = {"mmgsd": 20.0, "spcl": 40.0, "centre": 80.0}
-    return {o: {m: make_queries(e, points) for m, e in errors.items()} for o in ("cloth", "rope")}
+    return {o: {m: summarise_errors(make_queries(e, points)) for m, e in errors.items()} for o in ("cloth", "rope")}
 
 
 def test_plot_match_shows_source_and_answer_with_entropy():
@@ -92,45 +93,40 @@ def test_plot_combined_wants_four_queries_inwards():
 
 
 def test_compute_density_is_one_in_all_and_highest_at_the_data():
-    centres, density = plots.compute_density(np.full(100, 12.0))
-    assert density.sum() * plots.DENSITY_STEP == pytest.approx(1, abs=1e-3)
-    assert centres[density.argmax()] == pytest.approx(12, abs=plots.DENSITY_STEP)
+    centres, density = plots.compute_density(np.bincount([48] * 100), 0.25)
+    assert density.sum() * 0.25 == pytest.approx(1, abs=1e-3)
+    assert centres[density.argmax()] == pytest.approx(12.125)
 
 
 def test_compute_density_loses_nothing_at_zero():
-    _, density = plots.compute_density(np.zeros(10))
-    assert density.sum() * plots.DENSITY_STEP == pytest.approx(1, abs=1e-3)
+    _, density = plots.compute_density(np.array([10]), 0.25)
+    assert density.sum() * 0.25 == pytest.approx(1, abs=1e-3)
     assert density.argmax() == 0
 
 
 def test_plot_rmse_pdf_draws_visible_queries_in_percent():
-    figure = plots.plot_rmse_pdf(make_tables(), {"cloth": 200.0, "rope": 100.0})
+    figure = plots.plot_rmse_pdf(make_errors(), {"cloth": 200.0, "rope": 100.0})
     assert len(figure.axes) == 2
     for axis, peaks in zip(figure.axes, ((10, 20, 40), (20, 40, 80)), strict=True):
         found = [line.get_xdata()[line.get_ydata().argmax()] for line in axis.lines]
-        assert found == pytest.approx(peaks, abs=plots.DENSITY_STEP)
+        assert found == pytest.approx(peaks, abs=BIN_PX)
+    assert figure.axes[0].get_xlim()[1] == pytest.approx(80, abs=2 * BIN_PX)  # most of all errors are shown
     assert [line.get_linestyle() for line in figure.axes[0].lines] == ["-", "-", "--"]
     assert figure.axes[0].lines[0].get_color() == drawing.METHOD_COLOURS["mmgsd"]
 
 
 @pytest.mark.parametrize("points", [625, 25])
 def test_plot_spatial_rmse_draws_lines_and_maps(points):
-    figure = plots.plot_spatial_rmse(make_tables(points))
+    figure = plots.plot_spatial_rmse(make_errors(points))
     assert len(figure.axes) == 4  # the last one is the colour bar
     assert figure.axes[0].lines[1].get_ydata() == pytest.approx(40)
     values = [axis.images[0].get_array() for axis in figure.axes[1:3]]
     assert [float(v.mean()) for v in values] == pytest.approx([20, 40])
     limits = {axis.images[0].get_clim() for axis in figure.axes[1:3]}
     assert limits == {(0.0, 40.0)}
-    tables = make_tables(points)
-    del tables["cloth"]["spcl"]  # not trained
-    assert len(plots.plot_spatial_rmse(tables).axes) == 3
-
-
-def test_compute_point_errors_is_nan_where_never_asked():
-    errors = plots.compute_point_errors(make_queries(20.0, points=25))
-    assert errors.shape == (625,)
-    assert np.nanmax(errors) == 20 and np.isnan(errors[1])
+    errors = make_errors(points)
+    del errors["cloth"]["spcl"]  # not trained
+    assert len(plots.plot_spatial_rmse(errors).axes) == 3
 
 
 def test_plot_sigma_ablation_sorts_by_sigma():
@@ -217,6 +213,7 @@ def test_save_figure_gives_the_same_bytes_twice(tmp_path):
     lambda: plots.plot_combined({}, {}, {}),
     lambda: plots.plot_rmse_pdf({}, {}),
     lambda: plots.plot_rmse_pdf({"cloth": {}}, {"cloth": 1.0}),
+    lambda: plots.compute_density(np.zeros(3, int), 0.25),
     lambda: plots.plot_spatial_rmse({}),
     lambda: plots.plot_sigma_ablation({}),
     lambda: plots.plot_training({}),
