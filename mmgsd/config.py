@@ -26,6 +26,7 @@ DEFAULT_GROUP = {"cloth": "c4", "rope": "c2"}
 OWN_GROUP = "own"  # of any other object: what its file says
 CONTRASTIVE_REVISION = "r2"  # of PCL's and SPCL's training, to be raised with it: no older model passes for a new one
 CONTRASTIVE_MARGIN = 4.0  # of the presets: with the reference's 0.5, lite0's descriptors collapse before they learn
+LONGER = 4  # times the steps of the main table: a model of its own, to see what more training gains
 N_POINTS = 625  # material points of the cloth and the rope
 
 Config = TypeVar("Config", bound="RenderConfig | TrainConfig | EvaluateConfig")
@@ -195,14 +196,20 @@ class Preset:
     def main_table(self, object: str) -> dict[str, TrainConfig]:
         """The models of the main table by the names they have in it.
 
-        Beside the four methods, "spcl_dense": SPCL with the dense supervision that MMGSD gets.
+        Beside the four methods, "spcl_dense": SPCL with the dense supervision that MMGSD gets; "mmgsd_plain": MMGSD
+        without it; "mmgsd_long": MMGSD trained `LONGER` times as long.
         """
         models = {method: self.method(object, method) for method in METHODS}
-        return models | {"spcl_dense": dataclasses.replace(models["spcl"], prototype_weight=1.0)}
+        return models | {
+            "spcl_dense": dataclasses.replace(models["spcl"], prototype_weight=1.0),
+            "mmgsd_plain": dataclasses.replace(models["mmgsd"], prototype_weight=0.0),
+            "mmgsd_long": dataclasses.replace(models["mmgsd"], steps=LONGER * models["mmgsd"].steps),
+        }
 
     def budget_table(self, object: str) -> dict[str, TrainConfig]:
-        """The same models at the smaller budget of the studies."""
-        return dataclasses.replace(self, train=self.ablation).main_table(object)
+        """The same models at the smaller budget of the studies, which is one: without the longer training."""
+        models = dataclasses.replace(self, train=self.ablation).main_table(object)
+        return {method: model for method, model in models.items() if method != "mmgsd_long"}
 
     def sigma_table(self, object: str, sigmas_px: Sequence[float] = (), *, steps: int = 0) -> dict[str, TrainConfig]:
         """MMGSD with each σ, of the preset where ``sigmas_px`` names none: {"4": …}; 0 ``steps`` are that budget's."""

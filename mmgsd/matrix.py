@@ -30,7 +30,7 @@ from mmgsd.evaluation import (
 )
 from mmgsd.training import WEIGHTS, describe_run, train_model
 
-FIRST, LATER = ("mmgsd", "spcl"), ("unimodal", "pcl", "spcl_dense")  # of the main table: before the studies, and after
+FIRST, LATER = ("mmgsd", "spcl"), ("unimodal", "pcl", "spcl_dense", "mmgsd_plain")  # before the studies, and after
 GROUPS = ("c4", "v4", "d4")
 VALIDATIONS = 8  # RMSE on held-out simulations, in a model's log
 
@@ -38,8 +38,9 @@ Task = TrainConfig | tuple[str, str]  # a model to train and ask, or an object a
 
 
 def list_models(preset: Preset, *, seeds: int = 1) -> list[TrainConfig]:
-    """MMGSD and SPCL, the studies' models (symmetry, methods, σ), the rest of the main table, and further seeds."""
-    first, later = ([preset.main_table(name)[m] for m in methods for name in OBJECTS] for methods in (FIRST, LATER))
+    """MMGSD and SPCL, the studies' models (symmetry, methods, σ), the rest of the main table, further seeds."""
+    main, last = {name: preset.main_table(name) for name in OBJECTS}, (*LATER, "mmgsd_long")
+    first, later = ([main[name][method] for method in methods for name in OBJECTS] for methods in (FIRST, last))
     budget = [preset.budget_table(name)[m] for m in (*FIRST, *LATER) for name in OBJECTS]
     groups = [dataclasses.replace(preset.ablation["cloth"], group=group) for group in GROUPS]
     sigmas = [preset.sigma_table(name)[sigma] for sigma in preset.sigma_table("cloth") for name in OBJECTS]
