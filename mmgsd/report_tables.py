@@ -14,7 +14,7 @@ NOT_RUN = r"\emph{Not run for this preset.}"
 RULE = r"\midrule"
 SPECIAL = {c: rf"\{c}" for c in "&%$#_{}"} | {
     "\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "±": r"$\pm$", "°": r"$^\circ$",
-    "→": r"$\to$", "σ": r"$\sigma$", "–": "--",
+    "→": r"$\to$", "σ": r"$\sigma$", "×": r"$\times$", "–": "--",
 }  # fmt: skip
 
 Results = Mapping[str, Any]
@@ -159,7 +159,7 @@ def _choose(methods: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def _strip(label: str) -> str:
-    return label.replace("*", "")
+    return escape(label.replace("*", ""))
 
 
 def _say(value: float | None, form: str = ".1f", scale: float = 1) -> str:
