@@ -38,7 +38,7 @@ Task = TrainConfig | tuple[str, str]  # a model to train and ask, or an object a
 
 
 def list_models(preset: Preset, *, seeds: int = 1) -> list[TrainConfig]:
-    """MMGSD and SPCL, the studies' models (symmetry, methods, σ), the rest of the main table, further seeds."""
+    """MMGSD and SPCL, the studies' models (symmetry, methods, σ), the rest of the main table, and further seeds."""
     main, last = {name: preset.main_table(name) for name in OBJECTS}, (*LATER, "mmgsd_long")
     first, later = ([main[name][method] for method in methods for name in OBJECTS] for methods in (FIRST, last))
     budget = [preset.budget_table(name)[m] for m in (*FIRST, *LATER) for name in OBJECTS]
