@@ -118,13 +118,15 @@ class Dataset:
 def load_dataset(folder: Path | str, split: str = "train") -> Dataset:
     """Open one split after checking the table against the format and every named file's presence.
 
-    Raises FileNotFoundError where there is no data set, ValueError for an unknown split, DatasetError (which names
-    the file) for one that is damaged. ``check_dataset`` also decodes every image.
+    Raises FileNotFoundError where there is no data set, ValueError for an unknown split or one that was not rendered,
+    DatasetError (which names the file) for one that is damaged. ``check_dataset`` also decodes every image.
     """
     folder = Path(folder)
     if split not in SPLITS:
         raise ValueError(f"split must be one of {SPLITS}, got {split!r}")
     info = _read_info(folder / "dataset.json")
+    if split not in info["images"]:
+        raise ValueError(f"{folder} has no {split} images: render them as well (without only_test)")
     labels = _read_labels(folder / "labels.parquet", info)
     for name in [*labels.file, *labels["mask"]]:
         if not (folder / name).is_file():
@@ -137,17 +139,17 @@ def check_dataset(folder: Path | str) -> pd.DataFrame:
 
     Raises DatasetError at the first violation, with the file's name.
     """
-    rows = []
-    for split in SPLITS:
-        data = load_dataset(folder, split)
+    rows, info = [], _read_info(Path(folder) / "dataset.json")
+    splits = {split: load_dataset(folder, split) for split in SPLITS if split in info["images"]}
+    for split, data in splits.items():
         for index in range(len(data)):
             data.load_image(index)
             mask = data.load_mask(index)
             _check_labels_on_mask(data, index, mask)
         rows.append({"split": split, "images": len(data), "visible points": round(float(data.visible.mean()), 3)})
-    train, test = (set(load_dataset(folder, split).episode) for split in SPLITS)
-    if train & test:
-        raise DatasetError(f"{folder}: simulations {sorted(train & test)[:5]} are in both splits")
+    shared = set.intersection(*(set(data.episode) for data in splits.values())) if len(splits) > 1 else set()
+    if shared:
+        raise DatasetError(f"{folder}: simulations {sorted(shared)[:5]} are in both splits")
     return pd.DataFrame(rows).set_index("split")
 
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -56,6 +57,26 @@ def gather_figure_data(
     errors = {method: summarise_errors(table) for method, table in queries.items()}
     size = compute_object_size([data.load_mask(i) for i in range(len(data))])
     return FigureData(errors, size, answers, data.xy[second][data.group().distinct_modes(points[0])])
+
+
+def keep_stored(data: FigureData, path: Path, methods: Collection[str]) -> FigureData:
+    """``data`` with those of ``methods`` that it lacks and ``path`` holds, answered on another machine.
+
+    They are kept only where both have the same queries and the same example.
+    """
+    if not path.is_file():
+        return data
+    stored, example = load_figure_data(path), next(iter(data.answers.values()))
+    theirs = next(iter(stored.answers.values()))
+    asked, they_asked = (next(iter(one.errors.values())).asked for one in (data, stored))
+    same = [(asked, they_asked), (example.xy, theirs.xy), (data.true, stored.true)]
+    if not all(np.array_equal(ours, other) for ours, other in same):
+        return data
+    errors, answers = (
+        {method: value for method, value in old.items() if method in methods and method not in new} | new
+        for old, new in ((stored.errors, data.errors), (stored.answers, data.answers))
+    )
+    return dataclasses.replace(data, errors=errors, answers=answers)
 
 
 def save_figure_data(data: FigureData, path: Path) -> Path:

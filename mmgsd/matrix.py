@@ -98,8 +98,8 @@ def write_tables(preset: Preset, root: Path) -> None:
     write_sigma_table(preset, root)
 
 
-def write_main_table(preset: Preset, root: Path) -> None:
-    """Write rmse.json and runs.json, by the rule of `write_tables`."""
+def write_main_table(preset: Preset, root: Path) -> dict[str, dict[str, dict]]:
+    """Write rmse.json and runs.json, by the rule of `write_tables`; returns the former, {object: {method: row}}."""
     paths = Paths(root, preset.name)
     errors, costs = (_read(paths.results / f"{name}.json") for name in ("rmse", "runs"))
     tables, runs = {name: {} for name in OBJECTS}, {}
@@ -112,6 +112,7 @@ def write_main_table(preset: Preset, root: Path) -> None:
             runs |= {key: run} if run else {}
     write_results(runs, paths.results / "runs.json")
     write_results(tables, paths.results / "rmse.json")
+    return tables
 
 
 def write_sigma_table(preset: Preset, root: Path, sigmas_px: Sequence[float] = (), *, steps: int = 0) -> None:

@@ -41,9 +41,11 @@ class RenderError(RuntimeError):
 
 def render_dataset(
     config: RenderConfig, folder: Path, *,
-    workers: int = 0, scheduler: str = "", overwrite: bool = False, progress: bool = True,
+    only_test: bool = False, workers: int = 0, scheduler: str = "", overwrite: bool = False, progress: bool = True,
 ) -> Path:  # fmt: skip
     """Render the data set of ``config`` into ``folder`` and return it; a finished one is returned as it is.
+
+    ``only_test`` leaves out the training images: enough to evaluate models. A later call without it renders the rest.
 
     ``workers`` processes on this machine (0: one a core), or the ``scheduler`` of an existing Dask cluster by its
     address. Finished batches of a killed call are kept. ValueError where the folder holds another configuration.
@@ -51,22 +53,25 @@ def render_dataset(
     Objects other than ``cloth`` and ``rope`` are read from ``data/objects/<name>.json`` (`mmgsd.sheet`).
     """
     if (folder / "dataset.json").is_file() and not overwrite:
-        info = load_dataset(folder).info
+        info = load_dataset(folder, "test").info
         _check_same_config(config, info["config"] | {"scenes": info["versions"].get("scenes", 1)}, folder)
-        return folder
+        if only_test or "train" in info["images"]:
+            return folder
     partial = folder.with_name(folder.name + ".partial")
     if overwrite:
         shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True, exist_ok=True)
     _claim(config, partial)
-    missing = {name: job for name, job in plan_batches(config).items() if not (partial / f"{name}.zip").is_file()}
+    jobs = {name: job for name, job in plan_batches(config).items() if job["split"] == "test" or not only_test}
+    missing = {name: job for name, job in jobs.items() if not (partial / f"{name}.zip").is_file()}
     if missing:
         with _connect(workers, scheduler) as client:
             _render_batches(client, missing, partial, config, progress)
-    finished = _assemble(config, partial)
+    finished = _assemble(config, partial, list(jobs))
     shutil.rmtree(folder, ignore_errors=True)
     os.replace(finished, folder)
-    shutil.rmtree(partial)
+    if not only_test:
+        shutil.rmtree(partial)
     return folder
 
 
@@ -184,13 +189,13 @@ def _claim(config: RenderConfig, partial: Path) -> None:
     os.replace(aside, path)
 
 
-def _assemble(config: RenderConfig, partial: Path) -> Path:
-    """Unpack all batches into a folder of the data set's format, dataset.json last."""
+def _assemble(config: RenderConfig, partial: Path, names: list[str]) -> Path:
+    """Unpack the batches of these names into a folder of the data set's format, dataset.json last."""
     folder = partial / "dataset"
     shutil.rmtree(folder, ignore_errors=True)
     for name in ("images", "masks"):
         (folder / name).mkdir(parents=True)
-    rows = [row for name in plan_batches(config) for row in _unpack(partial / f"{name}.zip", folder)]
+    rows = [row for name in names for row in _unpack(partial / f"{name}.zip", folder)]
     labels = pd.DataFrame(rows)
     labels.to_parquet(folder / "labels.parquet", index=False)
     info = {

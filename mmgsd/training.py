@@ -74,11 +74,11 @@ def train_model(
     ``config.trunk_weights`` are of another network; FileNotFoundError where there are none.
     """
     weights = folder / WEIGHTS
-    data = load_dataset(dataset, "train")
     if weights.is_file() and not overwrite:
-        if load_metadata(weights).get("data") != data.fingerprint:
+        if load_metadata(weights).get("data") != load_dataset(dataset, "test").fingerprint:
             raise ValueError(f"{weights} was trained on another data set than {dataset}: use overwrite=True")
         return weights
+    data = load_dataset(dataset, "train")
     if data.object != config.object:
         raise ValueError(f"object is {config.object!r}, but {dataset} shows a {data.object}")
     with distributed.joined(config.groups, device or find_device()) as team, _repeatable(team.device):

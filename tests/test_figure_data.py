@@ -14,6 +14,7 @@ from mmgsd.figure_data import (
     FigureData,
     choose_example,
     gather_figure_data,
+    keep_stored,
     load_figure_data,
     save_figure_data,
 )
@@ -75,6 +76,20 @@ def test_kept_and_read_back(gathered: FigureData, tmp_path: Path) -> None:
         apart = np.abs(getattr(after, field.name).astype(float) - getattr(before, field.name))
         assert apart.mean() < (6 if field.name.startswith("image") else 1e-6)  # JPEG
     np.testing.assert_array_equal(back.true, gathered.true)
+
+
+def test_answers_of_another_machine_are_kept_where_questions_are_the_same(gathered: FigureData, tmp_path: Path) -> None:
+    ours, answer, path = gathered.errors["mmgsd"], gathered.answers["mmgsd"], tmp_path / "cloth.safetensors"
+    assert keep_stored(gathered, path, ["pcl"]) is gathered  # nothing is there
+    theirs = {name: dataclasses.replace(ours, mean_px=ours.mean_px + 1) for name in ("pcl", "mmgsd", "old")}
+    stored = dataclasses.replace(gathered, errors=theirs, answers=dict.fromkeys(("pcl", "mmgsd"), answer))
+    save_figure_data(stored, path)
+    both = keep_stored(gathered, path, ["pcl", "mmgsd", "sift"])
+    assert set(both.errors) == {"pcl", "mmgsd", "sift"} and set(both.answers) == {"pcl", "mmgsd"}
+    assert both.errors["mmgsd"] is ours
+    np.testing.assert_array_equal(both.errors["pcl"].mean_px, theirs["pcl"].mean_px)
+    other = dataclasses.replace(gathered, true=gathered.true + 1)
+    assert keep_stored(other, path, ["pcl"]) is other
 
 
 def test_other_queries_are_refused(gathered: FigureData, tmp_path: Path) -> None:

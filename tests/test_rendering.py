@@ -75,6 +75,22 @@ def test_a_killed_rendering_goes_on_and_ends_with_the_same_bytes(tmp_path: Path)
         render_dataset(dataclasses.replace(CONFIG, seed=6), killed)
 
 
+def test_test_images_alone_are_those_of_the_whole_data_set_and_the_rest_can_follow(tmp_path: Path) -> None:
+    whole, folder = (tmp_path / name for name in ("whole", "alone"))
+    render_dataset(CONFIG, whole, progress=False)
+    assert render_dataset(CONFIG, folder, only_test=True, progress=False) == folder
+    assert check_dataset(folder).images.to_dict() == {"test": 2}
+    alone, all_of_them = load_dataset(folder, "test"), load_dataset(whole, "test")
+    assert alone.fingerprint == all_of_them.fingerprint
+    assert all((folder / name).read_bytes() == (whole / name).read_bytes() for name in all_of_them.labels.file)
+    with pytest.raises(ValueError, match="alone has no train images"):
+        load_dataset(folder, "train")
+    render_dataset(CONFIG, folder, progress=False)
+    assert read_tree(folder) == read_tree(whole)
+    assert render_dataset(CONFIG, folder, only_test=True, progress=False) == folder
+    assert len(load_dataset(folder, "train")) == 3 and not (tmp_path / "alone.partial").exists()
+
+
 def test_a_lost_worker_of_a_foreign_cluster_costs_nothing_but_time(tmp_path: Path) -> None:
     """The scheduler is given by its address; one of its workers is killed while it renders."""
     undisturbed, disturbed = tmp_path / "undisturbed", tmp_path / "disturbed"

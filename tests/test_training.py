@@ -106,6 +106,18 @@ def test_a_finished_model_is_returned_as_it_is(cloth_dataset: Path, tmp_path: Pa
     assert weights.stat().st_mtime_ns == before
 
 
+def test_test_images_alone_do_for_a_finished_model_and_not_for_a_new_one(cloth_dataset: Path, tmp_path: Path) -> None:
+    weights = train(ONE_STEP, cloth_dataset, tmp_path / "model")
+    alone = shutil.copytree(cloth_dataset, tmp_path / "alone")
+    labels = load_dataset(alone, "test").labels
+    labels.to_parquet(alone / "labels.parquet")
+    info = json.loads((alone / "dataset.json").read_text()) | {"images": {"test": len(labels)}}
+    (alone / "dataset.json").write_text(json.dumps(info))
+    assert train(ONE_STEP, alone, tmp_path / "model") == weights
+    with pytest.raises(ValueError, match="alone has no train images"):
+        train(ONE_STEP, alone, tmp_path / "new")
+
+
 def test_a_model_of_another_data_set_is_not_taken_for_this_one(cloth_dataset: Path, tmp_path: Path) -> None:
     train(ONE_STEP, cloth_dataset, tmp_path / "model")
     other = shutil.copytree(cloth_dataset, tmp_path / "other")
