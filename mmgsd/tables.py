@@ -53,6 +53,12 @@ def make_symmetry_table(results: dict[str, dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
+def make_fixes_table(results: dict[str, dict[str, float]]) -> str:
+    """Markdown of PCL's errors with and without the ways to break the symmetry: {images: errors}, a row each."""
+    lines = ["| images | RMSE px | median px | pck@20px |", "|---|---|---|---|"]
+    return "\n".join([*lines, *(f"| {images} | {_format_errors(row)} |" for images, row in results.items())])
+
+
 def _make_lines(first: str, results: Errors, labels: dict[str, str]) -> list[str]:
     """A heading, and a row for each label whose key is in the results; a dash stands for what has not been run."""
     measures = "RMSE px | median px | pck@20px"
@@ -124,6 +130,7 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "sigma": ("paper/sigma.json", make_sigma_table),
     "sigma_4000": ("paper/sigma_4000.json", make_sigma_table),
     "symmetry": ("paper/symmetry.json", make_symmetry_table),
+    "fixes": ("paper/broken_symmetry.json", make_fixes_table),
     "quick": ("quick/rmse.json", make_results_table),
     "uncertainty": ("quick/uncertainty.json", make_uncertainty_table),
 }

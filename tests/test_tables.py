@@ -10,6 +10,7 @@ from mmgsd.config import find_root
 from mmgsd.tables import (
     LABELS,
     make_budget_table,
+    make_fixes_table,
     make_results_table,
     make_sigma_table,
     make_symmetry_table,
@@ -58,6 +59,12 @@ def test_a_group_has_its_errors_by_place() -> None:
     regions = {region: {"rmse_px": 10.0 * i} for i, region in enumerate(("corner", "edge", "interior"), start=1)}
     table = make_symmetry_table({"c4": {"rmse_mean": 15.04, "regions": regions}})
     assert table.splitlines()[2:] == ["| `c4`, the rotations | 15.0 | 10.0 | 20.0 | 30.0 |"]
+
+
+def test_the_two_fixes_are_rows_of_their_own() -> None:
+    row = RESULTS["rope"]["spcl"] | {"rmse_mean": 42.04}
+    lines = make_fixes_table({"rope, plain": row, "rope, ball at one end": row}).splitlines()
+    assert lines[2:] == ["| rope, plain | 42.0 | 5.0 | 50 % |", "| rope, ball at one end | 42.0 | 5.0 | 50 % |"]
 
 
 def test_uncertainty_before_and_after() -> None:
