@@ -33,19 +33,23 @@ Answer = Callable[[int, int, np.ndarray, np.ndarray], tuple[Mixture, Tensor]]
 
 
 def evaluate_model(
-    weights: Path, dataset: Path, config: EvaluateConfig, out: Path, *,
-    group: str = "", temperature: float | None = None, overwrite: bool = False, progress: bool = True,
+    weights: Path, dataset: Path, config: EvaluateConfig, out: Path, *, group: str = "", modes: int = 0,
+    temperature: float | None = None, overwrite: bool = False, progress: bool = True,
 ) -> Path:  # fmt: skip
     """Ask a trained model all queries and write the table ``out`` (Parquet).
 
     A table of the same weights, data set and configuration is returned as it is.
 
-    The true matches are those of ``group`` ("" is the object's own), whatever the model was taught. ``temperature`` of
-    the heatmaps is the model's own, calibrated one unless given.
+    The true matches are those of ``group`` ("" is the object's own), whatever the model was taught. As many modes are
+    fitted as a query has true matches, but at least ``modes``: of these the most probable ones are the answer.
+    ``temperature`` of the heatmaps is the model's own, calibrated one unless given. ValueError for ``modes`` below 0.
     """
+    if modes < 0:
+        raise ValueError(f"modes must be at least 0, got {modes!r}")
     data = load_dataset(dataset, "test")
     method = hashlib.sha256(Path(weights).read_bytes()).hexdigest()
     method += "" if temperature is None else f" at temperature {temperature:g}"
+    method += f" of {modes} modes" if modes else ""
     question = _describe_question(data, config, group, method)
     if _is_answered(out, question) and not overwrite:
         return out
@@ -53,7 +57,7 @@ def evaluate_model(
     if temperature is not None:
         matcher.temperature = temperature
     answer = _model_answer(matcher, data, config)
-    return _write(_ask(answer, data, config, group, progress, out.stem), out, question)
+    return _write(_ask(answer, data, config, group, progress, out.stem, modes), out, question)
 
 
 def evaluate_baseline(
@@ -164,7 +168,9 @@ def choose_points(count: int, total: int) -> np.ndarray:
     return np.unique(np.linspace(0, total - 1, min(count, total)).round().astype(int))
 
 
-def _ask(answer: Answer, data: Dataset, config: EvaluateConfig, group: str, progress: bool, name: str) -> pd.DataFrame:
+def _ask(
+    answer: Answer, data: Dataset, config: EvaluateConfig, group: str, progress: bool, name: str, modes: int = 0
+) -> pd.DataFrame:
     """Ask ``answer`` every query and compare with the truth; one row a query."""
     pairs = _draw_pairs(data, config)
     symmetry, points = data.group(group), choose_points(config.points, data.n_points)
@@ -172,19 +178,19 @@ def _ask(answer: Answer, data: Dataset, config: EvaluateConfig, group: str, prog
     count = np.array([len(o) for o in orbits])
     frames = []
     for pair, (first, second) in enumerate(tqdm(pairs, desc=f"evaluate {name}", disable=not progress, leave=False)):
-        fit, entropy = answer(first, second, data.xy[first, points], count)
+        fit, entropy = answer(first, second, data.xy[first, points], count.clip(min=modes))
         frame = pd.DataFrame({"pair": pair, "image0": first, "image1": second, "point": points})
         frame = frame.assign(visible=data.visible[first, points], n=count, entropy=entropy.cpu().numpy())
         hidden = [int((~data.visible[second, o]).sum()) for o in orbits]
         frame = frame.assign(hidden=hidden, outside=fit.outside.cpu().numpy())
-        modes, covariances = (t.double().cpu().numpy() for t in (fit.modes, fit.covariances))
+        means, covariances = (t.double().cpu().numpy() for t in (fit.modes, fit.covariances))
         frame["mahalanobis2"] = None
         for n in np.unique(count):
             rows = np.flatnonzero(count == n)
             true = data.xy[second][np.stack([orbits[r] for r in rows])].astype(float)
-            for column, values in compute_query_errors(modes[rows, :n], covariances[rows, :n], true).items():
+            for column, values in compute_query_errors(means[rows, :n], covariances[rows, :n], true).items():
                 frame.loc[rows, column] = values
-            distances = compute_mahalanobis2(modes[rows, :n], covariances[rows, :n], true)
+            distances = compute_mahalanobis2(means[rows, :n], covariances[rows, :n], true)
             frame.loc[rows, "mahalanobis2"] = pd.Series(list(distances.astype(np.float32)), rows)
         frames.append(frame)
     return pd.concat(frames, ignore_index=True)

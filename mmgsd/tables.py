@@ -55,8 +55,10 @@ def make_symmetry_table(results: dict[str, dict[str, Any]]) -> str:
 
 def make_fixes_table(results: dict[str, dict[str, float]]) -> str:
     """Markdown of PCL's errors with and without the ways to break the symmetry: {images: errors}, a row each."""
-    lines = ["| images | RMSE px | median px | pck@20px |", "|---|---|---|---|"]
-    return "\n".join([*lines, *(f"| {images} | {_format_errors(row)} |" for images, row in results.items())])
+    lines = ["| images | RMSE px | median px | pck@20px | nearest match px | the right one |", "|---" * 6 + "|"]
+    for images, row in results.items():
+        lines.append(f"| {images} | {_format_errors(row)} | {row['nearest_of_all']:.1f} | {100 * row['right']:.0f} % |")
+    return "\n".join(lines)
 
 
 def _make_lines(first: str, results: Errors, labels: dict[str, str]) -> list[str]:

@@ -255,17 +255,36 @@ def test_temperature_of_overconfident_and_timid_heatmaps(cloth_dataset: Path, mo
         assert matcher.temperature == pytest.approx(temperature, rel=0.05)
 
 
-def test_a_model_answers_every_query(cloth_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def untrained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """What stands for the weights of an untrained network."""
     config = dataclasses.replace(TrainConfig(), input_px=64, descriptor_dim=4)
     matcher = Matcher(build_network("lite0", 4, pretrained=False), config, modes=4, size=(485, 485), device="cpu")
     monkeypatch.setattr(evaluation.Matcher, "load", lambda path: matcher)
+    return write_weights(tmp_path)
+
+
+def test_a_model_answers_every_query(cloth_dataset: Path, tmp_path: Path, untrained: Path) -> None:
     queries = load_queries(
-        evaluate_model(
-            write_weights(tmp_path), cloth_dataset, CONFIG, tmp_path / "mmgsd.parquet", group="d4", progress=False
-        )
+        evaluate_model(untrained, cloth_dataset, CONFIG, tmp_path / "mmgsd.parquet", group="d4", progress=False)
     )
     assert np.isfinite(queries.rmse_px).all()
     assert queries[queries["pair"] == 0].n.tolist() == [4, 4, 1, 4, 4]  # points of a diagonal under d4
+
+
+def test_of_further_modes_the_most_probable_one_is_the_answer(
+    cloth_dataset: Path, tmp_path: Path, untrained: Path
+) -> None:
+    def ask(name: str, **how: object) -> pd.DataFrame:
+        out = tmp_path / f"{name}.parquet"
+        return load_queries(evaluate_model(untrained, cloth_dataset, CONFIG, out, progress=False, **how))
+
+    own, every = ask("own", group="identity", modes=4), ask("all", group="c4", modes=4)
+    assert (own.n == 1).all() and np.allclose(own.rmse_px, own.nearest_px)
+    assert (own.nearest_px >= every.nearest_px - 1e-6).all() and (own.nearest_px > every.nearest_px).any()
+    assert not np.allclose(own.rmse_px, ask("mean", group="identity").rmse_px)
+    with pytest.raises(ValueError, match="modes must be at least 0, got -1"):
+        ask("own", modes=-1)
 
 
 def test_a_point_that_sticks_out_of_the_image_is_asked_at_its_border(cloth_dataset: Path) -> None:

@@ -62,9 +62,9 @@ def test_a_group_has_its_errors_by_place() -> None:
 
 
 def test_the_two_fixes_are_rows_of_their_own() -> None:
-    row = RESULTS["rope"]["spcl"] | {"rmse_mean": 42.04}
+    row = RESULTS["rope"]["spcl"] | {"rmse_mean": 42.04, "nearest_of_all": 3.96, "right": 0.25}
     lines = make_fixes_table({"rope, plain": row, "rope, ball at one end": row}).splitlines()
-    assert lines[2:] == ["| rope, plain | 42.0 | 5.0 | 50 % |", "| rope, ball at one end | 42.0 | 5.0 | 50 % |"]
+    assert lines[2:] == [f"| rope, {fix} | 42.0 | 5.0 | 50 % | 4.0 | 25 % |" for fix in ("plain", "ball at one end")]
 
 
 def test_uncertainty_before_and_after() -> None:
