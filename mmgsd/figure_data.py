@@ -62,19 +62,21 @@ def gather_figure_data(
 def keep_stored(data: FigureData, path: Path, methods: Collection[str]) -> FigureData:
     """``data`` with those of ``methods`` that it lacks and ``path`` holds, answered on another machine.
 
-    They are kept only where both have the same queries and the same example.
+    Their errors are kept where both have the same queries, their answers where the example is the same as well.
     """
     if not path.is_file():
         return data
-    stored, example = load_figure_data(path), next(iter(data.answers.values()))
-    theirs = next(iter(stored.answers.values()))
-    asked, they_asked = (next(iter(one.errors.values())).asked for one in (data, stored))
-    same = [(asked, they_asked), (example.xy, theirs.xy), (data.true, stored.true)]
-    if not all(np.array_equal(ours, other) for ours, other in same):
-        return data
+    stored, examples = load_figure_data(path), [next(iter(data.answers.values()))]
+    examples.append(next(iter(stored.answers.values())))
+    asked = [next(iter(one.errors.values())).asked for one in (data, stored)]
+    same = np.array_equal(*asked)
+    same_example = np.array_equal(*(one.xy for one in examples)) and np.array_equal(data.true, stored.true)
     errors, answers = (
-        {method: value for method, value in old.items() if method in methods and method not in new} | new
-        for old, new in ((stored.errors, data.errors), (stored.answers, data.answers))
+        {method: value for method, value in old.items() if keep and method in methods and method not in new} | new
+        for old, new, keep in (
+            (stored.errors, data.errors, same),
+            (stored.answers, data.answers, same and same_example),
+        )
     )
     return dataclasses.replace(data, errors=errors, answers=answers)
 

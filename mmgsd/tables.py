@@ -134,7 +134,8 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "symmetry": ("paper/symmetry.json", make_symmetry_table),
     "fixes": ("paper/broken_symmetry.json", make_fixes_table),
     "quick": ("quick/rmse.json", make_results_table),
-    "uncertainty": ("quick/uncertainty.json", make_uncertainty_table),
+    "uncertainty": ("paper/uncertainty.json", make_uncertainty_table),
+    "uncertainty_quick": ("quick/uncertainty.json", make_uncertainty_table),
 }
 
 if __name__ == "__main__":

@@ -88,8 +88,10 @@ def test_answers_of_another_machine_are_kept_where_questions_are_the_same(gather
     assert set(both.errors) == {"pcl", "mmgsd", "sift"} and set(both.answers) == {"pcl", "mmgsd"}
     assert both.errors["mmgsd"] is ours
     np.testing.assert_array_equal(both.errors["pcl"].mean_px, theirs["pcl"].mean_px)
-    other = dataclasses.replace(gathered, true=gathered.true + 1)
-    assert keep_stored(other, path, ["pcl"]) is other
+    example = keep_stored(dataclasses.replace(gathered, true=gathered.true + 1), path, ["pcl"])
+    assert set(example.errors) == {"pcl", "mmgsd", "sift"} and set(example.answers) == {"mmgsd"}
+    fewer = {method: dataclasses.replace(row, asked=row.asked - 1) for method, row in gathered.errors.items()}
+    assert set(keep_stored(dataclasses.replace(gathered, errors=fewer), path, ["pcl"]).errors) == {"mmgsd", "sift"}
 
 
 def test_other_queries_are_refused(gathered: FigureData, tmp_path: Path) -> None:
