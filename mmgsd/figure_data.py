@@ -8,6 +8,7 @@ import os
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -66,24 +67,23 @@ def keep_stored(data: FigureData, path: Path, methods: Collection[str]) -> Figur
     """
     if not path.is_file():
         return data
-    stored, examples = load_figure_data(path), [next(iter(data.answers.values()))]
-    examples.append(next(iter(stored.answers.values())))
-    asked = [next(iter(one.errors.values())).asked for one in (data, stored)]
-    same = np.array_equal(*asked)
-    same_example = np.array_equal(*(one.xy for one in examples)) and np.array_equal(data.true, stored.true)
-    errors, answers = (
-        {method: value for method, value in old.items() if keep and method in methods and method not in new} | new
-        for old, new, keep in (
-            (stored.errors, data.errors, same),
-            (stored.answers, data.answers, same and same_example),
-        )
-    )
-    return dataclasses.replace(data, errors=errors, answers=answers)
+    stored = load_figure_data(path)
+    same = np.array_equal(_first(data.errors).asked, _first(stored.errors).asked)
+    example = [(_first(data.answers).xy, _first(stored.answers).xy), (data.true, stored.true)]
+    same_example = same and all(np.array_equal(ours, theirs) for ours, theirs in example)
+    missing = set(methods) - set(data.errors)
+    errors = {method: value for method, value in stored.errors.items() if same and method in missing}
+    answers = {method: value for method, value in stored.answers.items() if same_example and method in missing}
+    return dataclasses.replace(data, errors=errors | data.errors, answers=answers | data.answers)
+
+
+def _first(values: Mapping[str, Any]) -> Any:
+    return next(iter(values.values()))
 
 
 def save_figure_data(data: FigureData, path: Path) -> Path:
     """Write a safetensors file; ValueError where the methods did not answer the same queries."""
-    asked, example = next(iter(data.errors.values())).asked, next(iter(data.answers.values()))
+    asked, example = _first(data.errors).asked, _first(data.answers)
     tensors = {"asked": asked, "true": data.true}
     for name in ("image0", "image1"):
         image = cv2.cvtColor(getattr(example, name), cv2.COLOR_RGB2BGR)
