@@ -147,9 +147,9 @@ def check_dataset(folder: Path | str) -> pd.DataFrame:
             mask = data.load_mask(index)
             _check_labels_on_mask(data, index, mask)
         rows.append({"split": split, "images": len(data), "visible points": round(float(data.visible.mean()), 3)})
-    shared = set.intersection(*(set(data.episode) for data in splits.values())) if len(splits) > 1 else set()
-    if shared:
-        raise DatasetError(f"{folder}: simulations {sorted(shared)[:5]} are in both splits")
+    train, test = (set(splits[split].episode) if split in splits else set() for split in SPLITS)
+    if train & test:
+        raise DatasetError(f"{folder}: simulations {sorted(train & test)[:5]} are in both splits")
     return pd.DataFrame(rows).set_index("split")
 
 
