@@ -41,14 +41,12 @@ def make_parser() -> argparse.ArgumentParser:
     for command in (match, export):
         command.add_argument("--weights", required=True, metavar="FILE",
                              help="a trained model (safetensors), or a name in data/weights, like cloth")  # fmt: skip
-        command.add_argument("--input-scale", type=float, default=1.0, metavar="S",
-                             help="describe images at S times the size of training (default %(default)g)")  # fmt: skip
     return parser
 
 
 def _match(asked: argparse.Namespace) -> None:
     images = [mmgsd.read_image(path) for path in (asked.image0, asked.image1)]
-    answer = mmgsd.load(asked.weights, input_scale=asked.input_scale).match(*images, asked.xy, n=asked.n)
+    answer = mmgsd.load(asked.weights).match(*images, asked.xy, n=asked.n)
     described = describe_answer(answer)
     print(json.dumps(described) if asked.json else "\n".join(map(_format_query, described)))
     if asked.out:
@@ -58,7 +56,7 @@ def _match(asked: argparse.Namespace) -> None:
 def _export(asked: argparse.Namespace) -> None:
     from mmgsd.exporting import export_onnx
 
-    difference = export_onnx(mmgsd.load(asked.weights, input_scale=asked.input_scale), asked.out)
+    difference = export_onnx(mmgsd.load(asked.weights), asked.out)
     print(f"{asked.out}: descriptors differ from torch's by {difference:.1e} at most")
 
 

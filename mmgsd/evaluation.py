@@ -34,7 +34,7 @@ Answer = Callable[[int, int, np.ndarray, np.ndarray], tuple[Mixture, Tensor]]
 
 def evaluate_model(
     weights: Path, dataset: Path, config: EvaluateConfig, out: Path, *, group: str = "", modes: int = 0,
-    temperature: float | None = None, input_scale: float = 1.0, overwrite: bool = False, progress: bool = True,
+    temperature: float | None = None, overwrite: bool = False, progress: bool = True,
 ) -> Path:  # fmt: skip
     """Ask a trained model all queries and write the table ``out`` (Parquet).
 
@@ -42,8 +42,7 @@ def evaluate_model(
 
     The true matches are those of ``group`` ("" is the object's own), whatever the model was taught. As many modes are
     fitted as a query has true matches, but at least ``modes``: of these the most probable ones are the answer.
-    ``temperature`` of the heatmaps is the model's own, calibrated one unless given; images are described at
-    ``input_scale`` times the size of training. ValueError for ``modes`` below 0 or a scale outside of [0.5, 2].
+    ``temperature`` of the heatmaps is the model's own, calibrated one unless given. ValueError for ``modes`` below 0.
     """
     if modes < 0:
         raise ValueError(f"modes must be at least 0, got {modes!r}")
@@ -51,11 +50,10 @@ def evaluate_model(
     method = hashlib.sha256(Path(weights).read_bytes()).hexdigest()
     method += "" if temperature is None else f" at temperature {temperature:g}"
     method += f" of {modes} modes" if modes else ""
-    method += "" if input_scale == 1 else f" at input scale {input_scale:g}"
     question = _describe_question(data, config, group, method)
     if _is_answered(out, question) and not overwrite:
         return out
-    matcher = Matcher.load(weights, input_scale=input_scale)
+    matcher = Matcher.load(weights)
     if temperature is not None:
         matcher.temperature = temperature
     answer = _model_answer(matcher, data, config)

@@ -15,6 +15,7 @@ import onnxruntime
 import torch
 
 from mmgsd.matching import Matcher
+from mmgsd.network import compute_input_size
 
 TOLERANCE = 1e-3  # of a descriptor, relative to the largest
 
@@ -30,7 +31,7 @@ def export_onnx(matcher: Matcher, path: Path) -> float:
     """
     if path.suffix != ".onnx":
         raise ValueError(f"path must end with .onnx, got {path}")
-    width, height = matcher.input_size
+    width, height = compute_input_size(matcher.size, matcher.config.input_px)
     image = torch.rand(2, 3, height, width, generator=torch.Generator().manual_seed(0))
     network, aside = copy.deepcopy(matcher.network).cpu().eval(), path.with_suffix(".tmp")
     network.reduced_precision = False

@@ -28,7 +28,6 @@ from mmgsd.network import (
 
 QUARTERS = 4  # turns of an image whose descriptors are averaged: what noise they have differs
 RADIUS_PX = 20.0  # within which a robot's grasp still holds, unless the caller says otherwise
-INPUT_SCALES = (0.5, 2.0)  # between which an image may be described, times the training's size
 
 
 def compute_heatmap(squared_distances: Tensor, *, bandwidth: float | None = None, temperature: float = 1.0) -> Tensor:
@@ -121,18 +120,12 @@ class Match:
 
 
 class Matcher:
-    """Finds all matches of pixels between two images of an object, with trained weights.
-
-    Images are described at ``input_scale`` times the size that they had in training. ValueError outside of [0.5, 2].
-    """
+    """Finds all matches of pixels between two images of an object, with trained weights."""
 
     def __init__(
         self, network: torch.nn.Module, config: TrainConfig, *, modes: int, size: tuple[int, int], device: str = "",
-        input_scale: float = 1.0, bandwidth: float | None = None, temperature: float = 1.0,
+        bandwidth: float | None = None, temperature: float = 1.0,
     ) -> None:  # fmt: skip
-        if not INPUT_SCALES[0] <= input_scale <= INPUT_SCALES[1]:
-            raise ValueError(f"input_scale must be in [{INPUT_SCALES[0]}, {INPUT_SCALES[1]}], got {input_scale!r}")
-        self.input_size = compute_input_size(size, config.input_px * input_scale)
         self.device = torch.device(device or find_device())
         self.network = network.eval().to(self.device, memory_format=torch.channels_last)
         self.config, self.modes, self.size = config, modes, size
@@ -141,7 +134,7 @@ class Matcher:
         self.bandwidth = config.margin / 4 if bandwidth is None and config.method in CONTRASTIVE else bandwidth
 
     @classmethod
-    def load(cls, path: Path | str, *, device: str = "", input_scale: float = 1.0) -> Matcher:
+    def load(cls, path: Path | str, *, device: str = "") -> Matcher:
         """Weights from a safetensors file; FileNotFoundError, or ValueError for one that is damaged or not ours."""
         if not Path(path).is_file():
             raise FileNotFoundError(f"{path} does not exist: train a model, or give the path of its weights")
@@ -161,8 +154,7 @@ class Matcher:
             raise ValueError(f"{path} does not fit the network {config.network!r}: {error}") from error
         size = tuple(json.loads(metadata["size"]))
         scales = {name: float(metadata[name]) for name in ("bandwidth", "temperature") if name in metadata}
-        how = {"device": device, "input_scale": input_scale, **scales}
-        return cls(network, config, modes=int(metadata["modes"]), size=size, **how)
+        return cls(network, config, modes=int(metadata["modes"]), size=size, device=device, **scales)
 
     @torch.inference_mode()
     def describe(self, images: list[np.ndarray]) -> Tensor:
@@ -170,7 +162,8 @@ class Matcher:
 
         C is D, or 2 D where an image is described in both roles: as a source first, then as a target.
         """
-        small = np.stack([cv2.resize(image, self.input_size, interpolation=cv2.INTER_AREA) for image in images])
+        size = compute_input_size(self.size, self.config.input_px)
+        small = np.stack([cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in images])
         batch = torch.from_numpy(small).to(self.device).permute(0, 3, 1, 2).float() / 255
         return sum(self._describe_turned(batch, k) for k in range(self.turns)) / self.turns
 
@@ -225,11 +218,10 @@ class Pair:
         return make_match(self.image0, self.image1, points, cells, centres, self.matcher.modes if n is None else n)
 
 
-def load(weights: Path | str, *, device: str = "", input_scale: float = 1.0) -> Matcher:
+def load(weights: Path | str, *, device: str = "") -> Matcher:
     """A `Matcher` with the weights of a file, or of a name that ``data/weights`` holds: ``"cloth"``, ``"rope-spcl"``.
 
-    FileNotFoundError where there are none; ValueError for a file that is damaged or not ours, and for an
-    ``input_scale`` outside of [0.5, 2].
+    FileNotFoundError where there are none; ValueError for a file that is damaged or not ours.
     """
     if not Path(weights).is_file():
         folder = find_root() / "data" / "weights"
@@ -237,7 +229,7 @@ def load(weights: Path | str, *, device: str = "", input_scale: float = 1.0) -> 
         if str(weights) not in names:
             raise FileNotFoundError(f"{weights} must be a safetensors file or one of {', '.join(map(repr, names))}")
         weights = folder / f"{weights}.safetensors"
-    return Matcher.load(weights, device=device, input_scale=input_scale)
+    return Matcher.load(weights, device=device)
 
 
 def make_match(

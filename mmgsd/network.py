@@ -186,7 +186,7 @@ def build_network(
     raise ValueError(f"network must be 'lite0' or 'resnet34', got {name!r}")
 
 
-def compute_input_size(size: tuple[int, int], input_px: float) -> tuple[int, int]:
+def compute_input_size(size: tuple[int, int], input_px: int) -> tuple[int, int]:
     """(width, height) of the network's input: longer side ``input_px``, both multiples of 8."""
     scale = input_px / max(size)
     return tuple(max(16, round(side * scale / 8) * 8) for side in size)

@@ -1,4 +1,4 @@
-"""Where a model's error sits: against occlusion, the objects' states, the border and folds; against the input scale."""
+"""Where a model's error sits: against occlusion, the objects' states, the distance to the border and to a fold."""
 
 from __future__ import annotations
 
@@ -12,19 +12,7 @@ from matplotlib.figure import Figure
 from scipy.ndimage import distance_transform_cdt
 
 from mmgsd.dataset import Dataset
-from mmgsd.drawing import (
-    COLUMN_IN,
-    METHOD_COLOURS,
-    METHOD_LABELS,
-    PAGE_IN,
-    blend_heatmap,
-    check_filled,
-    draw_modes,
-    finish_axes,
-    make_grid,
-    mark_pixel,
-    styled,
-)
+from mmgsd.drawing import PAGE_IN, blend_heatmap, check_filled, draw_modes, finish_axes, make_grid, mark_pixel, styled
 from mmgsd.matching import Match
 
 FEW_PAIRS = 5  # of images: their mean says as much of them as of their states
@@ -141,21 +129,3 @@ def plot_worst(matches: Sequence[Match], true: Sequence[np.ndarray], errors_px: 
     for axis in axes.flat[len(matches) :]:
         axis.remove()
     return figure
-
-
-@styled
-def plot_input_scale(errors: Mapping[str, Mapping[str, Mapping[str, float]]]) -> Figure:
-    """Mean RMSE (px) against the scale at which images are described: ``errors`` {object: {method: {scale: px}}}."""
-    check_filled("errors", errors)
-    figure, axes = plt.subplots(1, len(errors), figsize=(COLUMN_IN, 1.7), layout="constrained", squeeze=False)
-    for axis, (name, methods) in zip(axes[0], errors.items(), strict=True):
-        check_filled(f"errors[{name!r}]", methods)
-        axis.axvline(1, color="0.8", lw=0.8, zorder=0)
-        for method, rows in methods.items():
-            points = sorted((float(scale), error) for scale, error in rows.items())
-            colour, label = METHOD_COLOURS[method], METHOD_LABELS[method]
-            axis.plot(*zip(*points, strict=True), "o-", ms=2.5, color=colour, label=label)
-        axis.set(title=name.capitalize(), xlabel="Input scale", ylim=(0, None))
-    axes[0, 0].set_ylabel("RMSE (px)")
-    axes[0, 0].legend(loc="lower right")
-    return finish_axes(figure)

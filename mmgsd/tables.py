@@ -44,15 +44,6 @@ def make_sigma_table(results: Errors) -> str:
     return "\n".join(_make_lines("σ px", results, {sigma: sigma for sigma in sigmas}))
 
 
-def make_scale_table(results: dict[str, dict[str, dict[str, dict]]]) -> str:
-    """The same measures by method and input scale, from {"errors": {object: {method: {scale: errors}}}}."""
-    asked = {(m, scale) for methods in results["errors"].values() for m, rows in methods.items() for scale in rows}
-    order = sorted(asked, key=lambda key: (list(LABELS).index(key[0]), float(key[1])))
-    errors = {name: {(m, scale): row for m, rows in methods.items() for scale, row in rows.items()}
-              for name, methods in results["errors"].items()}  # fmt: skip
-    return "\n".join(_make_lines("", errors, {(m, scale): f"{LABELS[m]}, input × {scale}" for m, scale in order}))
-
-
 def make_symmetry_table(results: dict[str, dict[str, Any]]) -> str:
     """Markdown from {group: errors, and under "regions" those by place}, a group a row."""
     lines = ["| taught and asked | all | corners | edges | interior |", "|---|---|---|---|---|"]
@@ -70,7 +61,7 @@ def make_fixes_table(results: dict[str, dict[str, float]]) -> str:
     return "\n".join(lines)
 
 
-def _make_lines(first: str, results: dict[str, dict], labels: dict[Any, str]) -> list[str]:
+def _make_lines(first: str, results: Errors, labels: dict[str, str]) -> list[str]:
     """A heading, and a row for each label whose key is in the results; a dash stands for what has not been run."""
     measures = "RMSE px | median px | pck@20px"
     heads = [f"{object}: {measures}" for object in PAPER]
@@ -140,7 +131,6 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "budget": ("paper/budget.json", make_budget_table),
     "sigma": ("paper/sigma.json", make_sigma_table),
     "sigma_4000": ("paper/sigma_4000.json", make_sigma_table),
-    "input_scale": ("paper/input_scale.json", make_scale_table),
     "symmetry": ("paper/symmetry.json", make_symmetry_table),
     "fixes": ("paper/broken_symmetry.json", make_fixes_table),
     "quick": ("quick/rmse.json", make_results_table),

@@ -78,8 +78,6 @@ def test_the_picture_is_drawn(weights, images, capsys, tmp_path, pixels):
         ({"xy": "a,b"}, 2, "must be two numbers such as 212,148, got 'a,b'"),
         ({"xy": "9000,3"}, 1, "xy must be finite and inside image0 of 300 x 200 px"),
         ({"--n": "0"}, 2, "must be a number from 1 on, or auto, got '0'"),
-        ({"--input-scale": "3"}, 1, "input_scale must be in [0.5, 2.0], got 3.0"),
-        ({"--input-scale": "fine"}, 2, "argument --input-scale: invalid float value: 'fine'"),
         ({"--weights": "towel"}, 1, "towel must be a safetensors file or one of 'cloth', "),
         ({"--out": "match.txt"}, 2, "argument --out: must end with .png"),
         ({"image1": "nowhere.png"}, 1, "nowhere.png"),
@@ -109,14 +107,6 @@ def test_onnx_gives_the_same_descriptors(weights, capsys, tmp_path):
     (got,) = session.run(None, {"image": image.numpy()})
     np.testing.assert_allclose(got, expected, atol=1e-3 * np.abs(expected).max())
     assert list(tmp_path.iterdir()) == [path]
-
-
-def test_onnx_has_the_size_asked_for(weights, capsys, tmp_path):
-    path = tmp_path / "cloth.onnx"
-    run(capsys, "export", path, "--weights", weights, "--input-scale", 1.5)
-    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
-    assert session.get_modelmeta().custom_metadata_map["input_size"] == "96 96"
-    assert session.run(None, {"image": np.zeros((1, 3, 96, 96), np.float32)})[0].shape[2:] == (24, 24)
 
 
 def test_onnx_needs_its_ending(weights, capsys, tmp_path):

@@ -14,7 +14,7 @@ from PIL import Image
 from safetensors.torch import save_file
 
 from mmgsd.config import TrainConfig
-from mmgsd.matching import Match, Matcher, compute_entropy, compute_heatmap, load, make_match, read_image
+from mmgsd.matching import Match, Matcher, compute_entropy, compute_heatmap, make_match, read_image
 from mmgsd.network import build_network, compute_cell_centres
 
 CONFIG = TrainConfig(input_px=64, descriptor_dim=8)
@@ -94,23 +94,6 @@ def test_modes_follow_the_targets_size(matcher: Matcher, image: np.ndarray) -> N
     double = np.repeat(np.repeat(image, 2, axis=0), 2, axis=1)
     one, two = (matcher.match(image, target, xy=[(50, 60)], n=1).modes[0, 0] for target in (image, double))
     np.testing.assert_allclose((two + 0.5) / 2 - 0.5, one, atol=0.5)
-
-
-def test_images_are_described_at_the_scale_asked_for(matcher: Matcher, image: np.ndarray, tmp_path: Path) -> None:
-    path = save_weights(tmp_path / "w.safetensors", matcher.network)
-    fine = Matcher.load(path, device="cpu", input_scale=1.5)
-    (width, height), (fine_width, fine_height) = matcher.input_size, fine.input_size
-    assert (fine_width, fine_height) == (1.5 * width, 1.5 * height)
-    one, two = (m.match(image, image[::-1], xy=[(50, 60)]) for m in (matcher, fine))
-    assert two.cells.shape[1:] == tuple(1.5 * side for side in one.cells.shape[1:])
-    np.testing.assert_allclose(two.heatmap.sum(), one.heatmap.sum(), rtol=1e-4)  # both over the target's own pixels
-
-
-@pytest.mark.parametrize("bad", [0.4, 2.1, -1.0, float("nan"), float("inf")])
-def test_other_scales(matcher: Matcher, tmp_path: Path, bad: float) -> None:
-    path = save_weights(tmp_path / "w.safetensors", matcher.network)
-    with pytest.raises(ValueError, match=r"input_scale must be in \[0.5, 2.0\], got"):
-        load(path, device="cpu", input_scale=bad)
 
 
 @pytest.mark.parametrize("form", ["rgba", "float32", "float64"])

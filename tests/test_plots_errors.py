@@ -12,14 +12,7 @@ from heatmaps import SIZE
 
 from mmgsd.dataset import Dataset, load_dataset
 from mmgsd.matching import Match
-from mmgsd.plots_errors import (
-    choose_worst,
-    describe_queries,
-    plot_error_analysis,
-    plot_input_scale,
-    plot_worst,
-    summarise_states,
-)
+from mmgsd.plots_errors import choose_worst, describe_queries, plot_error_analysis, plot_worst, summarise_states
 
 
 @pytest.fixture
@@ -93,13 +86,3 @@ def test_states_of_enough_pairs_have_no_brackets_and_absent_ones_no_number(data:
 def test_nothing_to_draw_is_refused() -> None:
     with pytest.raises(ValueError, match="tables must not be empty"):
         plot_error_analysis({})
-    with pytest.raises(ValueError, match=r"errors\['cloth'\] must not be empty"):
-        plot_input_scale({"cloth": {}})
-
-
-def test_input_scales_are_a_line_a_method() -> None:
-    cloth = {"mmgsd": {"1.2": 20.0, "1": 25.0}, "spcl": {"1": 40.0}}
-    figure = plot_input_scale({"cloth": cloth, "rope": {"mmgsd": {"1": 9.0}}})
-    lines = [line for line in figure.axes[0].lines if line.get_label() in ("MMGSD", "SPCL")]
-    assert [line.get_xydata().tolist() for line in lines] == [[[1, 25], [1.2, 20]], [[1, 40]]]
-    assert [axis.get_title() for axis in figure.axes] == ["Cloth", "Rope"]

@@ -12,7 +12,6 @@ from mmgsd.tables import (
     make_budget_table,
     make_fixes_table,
     make_results_table,
-    make_scale_table,
     make_sigma_table,
     make_symmetry_table,
     make_uncertainty_table,
@@ -54,17 +53,6 @@ def test_sigmas_are_in_order_of_their_width() -> None:
     assert rows[0].startswith("| σ px | cloth: RMSE px | median px | pck@20px | rope: RMSE px")
     assert [line.split(" | ")[0] for line in rows[2:]] == ["| 2", "| 16"]
     assert rows[3].endswith("| 50 % | – | – | – |")
-
-
-def test_input_scales_are_in_order_and_an_object_may_have_its_own() -> None:
-    row = RESULTS["cloth"]["spcl"]
-    errors = {"cloth": {"spcl": {"1": row}, "mmgsd": {"1.2": row, "1": row}}, "rope": {"mmgsd": {"1": row, "1.1": row}}}
-    lines = make_scale_table({"errors": errors}).splitlines()[2:]
-    heads = [
-        f"| {LABELS[m]}, input × {scale}" for m, scale in (*(("mmgsd", s) for s in ("1", "1.1", "1.2")), ("spcl", 1))
-    ]
-    assert [line.split(" | ")[0] for line in lines] == heads
-    assert [line.count("–") for line in lines] == [0, 3, 3, 3]
 
 
 def test_a_group_has_its_errors_by_place() -> None:
