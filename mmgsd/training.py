@@ -20,6 +20,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 from torch.nn import functional as F
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+from torch.utils import deterministic
 from tqdm.auto import tqdm
 
 from mmgsd import distributed, losses
@@ -304,12 +305,14 @@ def describe_run(weights: Path | str) -> dict[str, int | float | str]:
 @contextmanager
 def _repeatable(device: torch.device) -> Iterator[None]:
     """Sums in the same order every time, on a CPU: a GPU has no such kernel for the gradient of sampling."""
-    before = torch.are_deterministic_algorithms_enabled()
+    before, filled = torch.are_deterministic_algorithms_enabled(), deterministic.fill_uninitialized_memory
     torch.use_deterministic_algorithms(before or device.type == "cpu")
+    deterministic.fill_uninitialized_memory = False  # a fifth of a step went into memory that is overwritten at once
     try:
         yield
     finally:
         torch.use_deterministic_algorithms(before)
+        deterministic.fill_uninitialized_memory = filled
 
 
 def _make_network(config: TrainConfig) -> torch.nn.Module:
