@@ -26,7 +26,7 @@ DEFAULT_GROUP = {"cloth": "c4", "rope": "c2"}
 OWN_GROUP = "own"  # of any other object: what its file says
 CONTRASTIVE_REVISION = "r2"  # of PCL's and SPCL's training, to be raised with it: no older model passes for a new one
 CONTRASTIVE_MARGIN = 4.0  # of the presets: with the reference's 0.5, lite0's descriptors collapse before they learn
-LONGER = 4  # times the steps of the main table: a model of its own, to see what more training gains
+LONGER = 3  # times the steps of the main table: a model of its own, to see what more training gains
 N_POINTS = 625  # material points of the cloth and the rope
 
 Config = TypeVar("Config", bound="RenderConfig | TrainConfig | EvaluateConfig")

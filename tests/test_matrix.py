@@ -27,7 +27,7 @@ def test_the_models_that_matter_most_come_first() -> None:
     order, steps = [m.method for m in models], [m.steps for m in models]
     assert models[4] == load_preset("paper").budget_table("cloth")["mmgsd"]  # one model, two tables
     assert max(i for i, m in enumerate(models) if m.sigma_px == 16) == max(i for i, n in enumerate(steps) if n == 1000)
-    assert set(steps[4:26]) == {1000} and steps[34:36] == [16000] * 2 and set(steps[26:34] + steps[36:]) == {4000}
+    assert set(steps[4:26]) == {1000} and steps[34:36] == [12000] * 2 and set(steps[26:34] + steps[36:]) == {4000}
     assert order[-8:] == ["mmgsd", "mmgsd", "spcl", "spcl"] * 2
     assert len({m.name for m in models}) == len(models)
     assert {m.group for m in models if m.object == "cloth"} == {"c4", "v4", "d4"}
