@@ -188,18 +188,20 @@ class Preset:
     sigmas_px: tuple[float, ...]
 
     def method(self, object: str, method: str) -> TrainConfig:
-        """The training configuration of one method on one object; they differ in the loss and its margin alone."""
-        train = self.train[object]
-        margin = CONTRASTIVE_MARGIN if method in CONTRASTIVE else train.margin
-        return dataclasses.replace(train, method=method, margin=margin)
+        """The training configuration of one model of the main table; ValueError for a name that it does not have."""
+        models = self.main_table(object)
+        _check_choice("method", method, tuple(models))
+        return models[method]
 
     def main_table(self, object: str) -> dict[str, TrainConfig]:
         """The models of the main table by the names they have in it.
 
-        Beside the four methods, "spcl_dense": SPCL with the dense supervision that MMGSD gets; "mmgsd_plain": MMGSD
-        without it; "mmgsd_long": MMGSD trained `LONGER` times as long.
+        The four methods differ in the loss and its margin alone. Beside them, "spcl_dense": SPCL with the dense
+        supervision that MMGSD gets; "mmgsd_plain": MMGSD without it; "mmgsd_long": MMGSD with `LONGER` times the steps.
         """
-        models = {method: self.method(object, method) for method in METHODS}
+        train = self.train[object]
+        models = {method: dataclasses.replace(train, method=method) for method in METHODS}
+        models |= {m: dataclasses.replace(models[m], margin=CONTRASTIVE_MARGIN) for m in CONTRASTIVE}
         return models | {
             "spcl_dense": dataclasses.replace(models["spcl"], prototype_weight=1.0),
             "mmgsd_plain": dataclasses.replace(models["mmgsd"], prototype_weight=0.0),

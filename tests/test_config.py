@@ -10,6 +10,7 @@ import pytest
 from mmgsd import config as config_module
 from mmgsd.config import (
     CONTRASTIVE_MARGIN,
+    LONGER,
     METHODS,
     OBJECTS,
     EvaluateConfig,
@@ -53,6 +54,14 @@ def test_methods_of_a_preset_differ_in_the_loss_alone(method: str) -> None:
     model, mmgsd = preset.method("cloth", method), preset.train["cloth"]
     assert dataclasses.replace(model, method="mmgsd", margin=mmgsd.margin) == mmgsd
     assert (model.margin == CONTRASTIVE_MARGIN) == (method in ("pcl", "spcl"))
+
+
+def test_any_model_of_the_main_table_is_found_by_its_name() -> None:
+    preset = load_preset("quick")
+    assert preset.method("rope", "mmgsd_long").steps == LONGER * preset.method("rope", "mmgsd").steps
+    assert preset.method("cloth", "spcl_dense").dense_weight == 1
+    with pytest.raises(ValueError, match="method must be one of 'pcl', .*'mmgsd_long'.*got 'mmgsd_lang'"):
+        preset.method("cloth", "mmgsd_lang")
 
 
 def test_unknown_preset_names_the_accepted_ones() -> None:
