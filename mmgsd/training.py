@@ -307,7 +307,7 @@ def _repeatable(device: torch.device) -> Iterator[None]:
     """Sums in the same order every time, on a CPU: a GPU has no such kernel for the gradient of sampling."""
     before, filled = torch.are_deterministic_algorithms_enabled(), deterministic.fill_uninitialized_memory
     torch.use_deterministic_algorithms(before or device.type == "cpu")
-    deterministic.fill_uninitialized_memory = False  # a fifth of a step went into memory that is overwritten at once
+    deterministic.fill_uninitialized_memory = False  # a seventh of a step went into memory that is overwritten at once
     try:
         yield
     finally:
