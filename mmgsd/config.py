@@ -27,6 +27,8 @@ OWN_GROUP = "own"  # of any other object: what its file says
 CONTRASTIVE_REVISION = "r2"  # of PCL's and SPCL's training, to be raised with it: no older model passes for a new one
 CONTRASTIVE_MARGIN = 4.0  # of the presets: with the reference's 0.5, lite0's descriptors collapse before they learn
 LONGER = 3  # times the steps of the main table: a model of its own, to see what more training gains
+LONGER_TRAINED = ("mmgsd_long", "mmgsd_fine")
+FINER = 1.5  # times the input, at least, on which that one is then trained further: another
 N_POINTS = 625  # material points of the cloth and the rope
 
 Config = TypeVar("Config", bound="RenderConfig | TrainConfig | EvaluateConfig")
@@ -101,8 +103,8 @@ class TrainConfig:
     method: str = "mmgsd"
     group: str = ""  # symmetry group the matches come from; "" is the object's own (c4, c2, or its file's)
     network: str = "lite0"  # or "resnet34", the contrastive papers' reference
-    # what to start from: for lite0 a name in data/weights, or a file trained here with the same network ("": ImageNet);
-    # for resnet34 a safetensors file of ImageNet weights with torchvision's names ("": random)
+    # what to start from: for lite0 the name of a model trained beside it, or one in data/weights, or a file, all of the
+    # same network ("": ImageNet); for resnet34 a safetensors file of torchvision's ImageNet weights ("": random)
     trunk_weights: str = ""
     descriptor_dim: int = 32
     roles: int = 1  # 2: a pixel that is asked about and one that answers have descriptors of their own
@@ -197,21 +199,26 @@ class Preset:
         """The models of the main table by the names they have in it.
 
         The four methods differ in the loss and its margin alone. Beside them, "spcl_dense": SPCL with the dense
-        supervision that MMGSD gets; "mmgsd_plain": MMGSD without it; "mmgsd_long": MMGSD with `LONGER` times the steps.
+        supervision that MMGSD gets; "mmgsd_plain": MMGSD without it; "mmgsd_long": MMGSD with `LONGER` times the steps;
+        "mmgsd_fine": that model after a quarter as many steps more, on larger images, with the method's own loss alone.
         """
         train = self.train[object]
         models = {method: dataclasses.replace(train, method=method) for method in METHODS}
         models |= {m: dataclasses.replace(models[m], margin=CONTRASTIVE_MARGIN) for m in CONTRASTIVE}
+        longer = dataclasses.replace(models["mmgsd"], steps=LONGER * train.steps)
+        finer = {"input_px": math.ceil(FINER * train.input_px / 32) * 32, "steps": max(1, longer.steps // 4)}
+        gentler = {"learning_rate": train.learning_rate / 2, "sigma_start_px": 8.0, "prototype_weight": 0.0}
         return models | {
             "spcl_dense": dataclasses.replace(models["spcl"], prototype_weight=1.0),
             "mmgsd_plain": dataclasses.replace(models["mmgsd"], prototype_weight=0.0),
-            "mmgsd_long": dataclasses.replace(models["mmgsd"], steps=LONGER * models["mmgsd"].steps),
+            "mmgsd_long": longer,
+            "mmgsd_fine": dataclasses.replace(longer, trunk_weights=longer.name, **finer, **gentler),
         }
 
     def budget_table(self, object: str) -> dict[str, TrainConfig]:
-        """The same models at the smaller budget of the studies, which is one: without the longer training."""
+        """The same models at the smaller budget of the studies, which is one: without those trained longer."""
         models = dataclasses.replace(self, train=self.ablation).main_table(object)
-        return {method: model for method, model in models.items() if method != "mmgsd_long"}
+        return {method: model for method, model in models.items() if method not in LONGER_TRAINED}
 
     def sigma_table(self, object: str, sigmas_px: Sequence[float] = (), *, steps: int = 0) -> dict[str, TrainConfig]:
         """MMGSD with each σ, of the preset where ``sigmas_px`` names none: {"4": …}; 0 ``steps`` are that budget's."""

@@ -18,7 +18,7 @@ from pathlib import Path
 from dask.distributed import Client, as_completed
 from tqdm.auto import tqdm
 
-from mmgsd.config import OBJECTS, Paths, Preset, TrainConfig, find_root, load_preset
+from mmgsd.config import LONGER_TRAINED, OBJECTS, Paths, Preset, TrainConfig, find_root, load_preset
 from mmgsd.evaluation import (
     BASELINES,
     CHANCE,
@@ -39,7 +39,7 @@ Task = TrainConfig | tuple[str, str]  # a model to train and ask, or an object a
 
 def list_models(preset: Preset, *, seeds: int = 1) -> list[TrainConfig]:
     """MMGSD and SPCL, the studies' models (symmetry, methods, σ), the rest of the main table, and further seeds."""
-    main, last = {name: preset.main_table(name) for name in OBJECTS}, (*LATER, "mmgsd_long")
+    main, last = {name: preset.main_table(name) for name in OBJECTS}, (*LATER, *LONGER_TRAINED)
     first, later = ([main[name][method] for method in methods for name in OBJECTS] for methods in (FIRST, last))
     budget = [preset.budget_table(name)[m] for m in (*FIRST, *LATER) for name in OBJECTS]
     groups = [dataclasses.replace(preset.ablation["cloth"], group=group) for group in GROUPS]
@@ -59,12 +59,19 @@ def name_task(task: Task) -> str:
     return task.name if isinstance(task, TrainConfig) else "-".join(task)
 
 
-def run_task(task: Task, preset: Preset, root: Path, *, progress: bool = False) -> tuple[str, float]:
-    """Train a model and ask it the preset's questions, or ask a baseline, unless that is done; name and RMSE (px)."""
+def run_task(
+    task: Task, preset: Preset, root: Path, after: tuple[str, float] | None = None, *, progress: bool = False
+) -> tuple[str, float]:
+    """Train a model and ask it the preset's questions, or ask a baseline, unless that is done; name and RMSE (px).
+
+    A model of the preset that it starts from is trained first; ``after`` is that one's result, to be waited for.
+    """
     paths, name = Paths(root, preset.name), name_task(task)
     if isinstance(task, TrainConfig):
-        data, every = paths.dataset(task.object), max(1, task.steps // VALIDATIONS)
-        weights = train_model(task, data, paths.model(task), progress=progress, validate_every=every)
+        data = paths.dataset(task.object)
+        for model in (*_find_start(task, preset), task):
+            every = max(1, model.steps // VALIDATIONS)
+            weights = train_model(model, data, paths.model(model), progress=progress, validate_every=every)
         how = {"group": task.group, "progress": progress}
         out = evaluate_model(weights, data, preset.evaluate, paths.queries(name), **how)
     else:
@@ -72,6 +79,12 @@ def run_task(task: Task, preset: Preset, root: Path, *, progress: bool = False) 
         evaluate_baseline(task[1], data, preset.evaluate, out, progress=progress)
     queries = load_queries(out)
     return name, float(queries.rmse_px[queries.visible].mean())
+
+
+def _find_start(task: Task, preset: Preset) -> list[TrainConfig]:
+    """The model of the preset that a task starts from, if it does from one."""
+    start = task.trunk_weights if isinstance(task, TrainConfig) else ""
+    return [model for model in list_models(preset) if model.name == start]
 
 
 def run_tasks(tasks: list[Task], preset: Preset, root: Path, *, scheduler: str = "") -> Iterator[tuple]:
@@ -83,9 +96,11 @@ def run_tasks(tasks: list[Task], preset: Preset, root: Path, *, scheduler: str =
         yield from (run_task(task, preset, root, progress=True) for task in tasks)
         return
     with Client(scheduler) as client:
-        futures = [client.submit(run_task, task, preset, root, pure=False, priority=-i)
-                   for i, task in enumerate(tasks)]  # fmt: skip
-        yield from (future.result() for future in as_completed(futures))
+        futures = {}
+        for i, task in enumerate(tasks):
+            after = next((futures.get(start.name) for start in _find_start(task, preset)), None)
+            futures[name_task(task)] = client.submit(run_task, task, preset, root, after, pure=False, priority=-i)
+        yield from (future.result() for future in as_completed(futures.values()))
 
 
 def write_tables(preset: Preset, root: Path) -> None:

@@ -146,7 +146,7 @@ class _Run:
         self.permutations = torch.tensor(known, device=device)
         self.images = load_training_images(self.data, config.input_px)
         torch.manual_seed(config.seed)
-        self.network = _make_network(config).to(device, memory_format=torch.channels_last)
+        self.network = _make_network(config, folder.parent).to(device, memory_format=torch.channels_last)
         # the average of the last steps' weights, statistics of batch normalisation included, is what is kept
         average = get_ema_multi_avg_fn(1 - 1 / max(2.0, config.steps / 50))
         self.average = AveragedModel(self.network, multi_avg_fn=average, use_buffers=True)
@@ -315,9 +315,10 @@ def _repeatable(device: torch.device) -> Iterator[None]:
         deterministic.fill_uninitialized_memory = filled
 
 
-def _make_network(config: TrainConfig) -> torch.nn.Module:
-    """The network as training starts from it."""
-    start = config.trunk_weights
+def _make_network(config: TrainConfig, models: Path) -> torch.nn.Module:
+    """The network as training starts from it; ``models`` is the folder of the models trained beside it."""
+    start, beside = config.trunk_weights, models / config.trunk_weights / WEIGHTS
+    start = str(beside) if start and beside.is_file() else start
     network = build_network(config.network, config.descriptor_dim, roles=config.roles, trunk_weights=start)
     if start and config.network == "lite0":  # of a model of ours; resnet34 has read torchvision's
         trained = load(start, device="cpu")

@@ -59,6 +59,8 @@ def test_methods_of_a_preset_differ_in_the_loss_alone(method: str) -> None:
 def test_any_model_of_the_main_table_is_found_by_its_name() -> None:
     preset = load_preset("quick")
     assert preset.method("rope", "mmgsd_long").steps == LONGER * preset.method("rope", "mmgsd").steps
+    finer = preset.method("rope", "mmgsd_fine")
+    assert finer.trunk_weights == preset.method("rope", "mmgsd_long").name and finer.input_px == 192
     assert preset.method("cloth", "spcl_dense").dense_weight == 1
     with pytest.raises(ValueError, match="method must be one of 'pcl', .*'mmgsd_long'.*got 'mmgsd_lang'"):
         preset.method("cloth", "mmgsd_lang")

@@ -27,14 +27,17 @@ def test_the_models_that_matter_most_come_first() -> None:
     order, steps = [m.method for m in models], [m.steps for m in models]
     assert models[4] == load_preset("paper").budget_table("cloth")["mmgsd"]  # one model, two tables
     assert max(i for i, m in enumerate(models) if m.sigma_px == 16) == max(i for i, n in enumerate(steps) if n == 1000)
-    assert set(steps[4:26]) == {1000} and steps[34:36] == [12000] * 2 and set(steps[26:34] + steps[36:]) == {4000}
+    assert set(steps[4:26]) == {1000} and set(steps[26:34] + steps[38:]) == {4000}
+    assert steps[34:38] == [12000] * 2 + [3000] * 2 and [m.trunk_weights for m in models[36:38]] == [
+        m.name for m in models[34:36]
+    ]  # what a model starts from comes before it
     assert order[-8:] == ["mmgsd", "mmgsd", "spcl", "spcl"] * 2
     assert len({m.name for m in models}) == len(models)
     assert {m.group for m in models if m.object == "cloth"} == {"c4", "v4", "d4"}
     assert sorted({m.sigma_px for m in models}) == [1.0, 2.0, 4.0, 8.0, 16.0]
     assert {m.seed for m in models if m.method == "mmgsd"} == {0, 1, 2}
     assert sum(m.method == "spcl" and m.dense_weight == 1.0 for m in models) == 4
-    assert sum(m.method == "mmgsd" and m.dense_weight == 0.0 for m in models) == 4
+    assert sum(m.method == "mmgsd" and m.dense_weight == 0.0 for m in models) == 6
 
 
 def test_baselines_come_before_the_studies() -> None:
@@ -117,3 +120,17 @@ def test_a_cluster_gives_what_this_process_gives(tiny_dataset: Callable[..., Pat
         assert (root / "data" / "generated" / "smoke" / "models" / model.name / "weights.safetensors").is_file()
     assert dict(run_tasks(models, preset, root)) == there
     assert set(there) == {model.name for model in models}
+
+
+def test_what_a_model_starts_from_is_trained_before_it(tiny_dataset: Callable[..., Path], tmp_path: Path) -> None:
+    preset = make_tiny(tiny_dataset, tmp_path)
+    train = {"cloth": dataclasses.replace(preset.train["cloth"], steps=1, input_px=64), "rope": preset.train["rope"]}
+    preset = dataclasses.replace(preset, train=train)
+    longer, finer = (preset.method("cloth", method) for method in ("mmgsd_long", "mmgsd_fine"))
+    models = tmp_path / "data" / "generated" / "smoke" / "models"
+    (_, rmse), *_ = run_tasks([finer], preset, tmp_path)
+    assert all((models / model.name / "weights.safetensors").is_file() for model in (longer, finer))
+    how = {"n_workers": 2, "threads_per_worker": 1, "processes": False, "dashboard_address": "127.0.0.1:0"}
+    with LocalCluster(**how, silence_logs="ERROR") as cluster:
+        there = dict(run_tasks([longer, finer], preset, tmp_path, scheduler=cluster.scheduler_address))
+    assert there[finer.name] == rmse

@@ -146,8 +146,10 @@ def test_overwrite_trains_again_to_the_same_weights(cloth_dataset: Path, tmp_pat
 
 def test_training_starts_from_trained_weights(cloth_dataset: Path, tmp_path: Path) -> None:
     first = train(ONE_STEP, cloth_dataset, tmp_path / "first")
-    config = dataclasses.replace(ONE_STEP, trunk_weights=str(first), seed=1, learning_rate=1e-9)
+    config = dataclasses.replace(ONE_STEP, trunk_weights=str(first), seed=1, learning_rate=1e-9, input_px=96)
     went_on = load_file(train(config, cloth_dataset, tmp_path / "second"))
+    beside = load_file(train(dataclasses.replace(config, trunk_weights="first"), cloth_dataset, tmp_path / "third"))
+    assert all(torch.equal(went_on[name], value) for name, value in beside.items())
     for name, value in load_file(first).items():
         if not name.endswith(("running_mean", "running_var", "num_batches_tracked")):
             torch.testing.assert_close(went_on[name], value, rtol=0, atol=1e-6)
