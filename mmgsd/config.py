@@ -25,6 +25,8 @@ IMAGE_SIZE = {"cloth": (485, 485), "rope": (640, 480)}  # (width, height) px, pa
 DEFAULT_GROUP = {"cloth": "c4", "rope": "c2"}
 OWN_GROUP = "own"  # of any other object: what its file says
 CONTRASTIVE_REVISION = "r2"  # of PCL's and SPCL's training, to be raised with it: no older model passes for a new one
+PASSES = {"lite0": 1, "lite0x2": 2}  # over the feature pyramid
+NETWORKS = (*PASSES, "resnet34")  # the last is the contrastive papers' reference
 CONTRASTIVE_MARGIN = 4.0  # of the presets: with the reference's 0.5, lite0's descriptors collapse before they learn
 LONGER = 3  # times the steps of the main table: a model of its own, to see what more training gains
 LONGER_TRAINED = ("mmgsd_long", "mmgsd_fine")
@@ -102,7 +104,7 @@ class TrainConfig:
     object: str = "cloth"
     method: str = "mmgsd"
     group: str = ""  # symmetry group the matches come from; "" is the object's own (c4, c2, or its file's)
-    network: str = "lite0"  # or "resnet34", the contrastive papers' reference
+    network: str = "lite0"  # or another of `NETWORKS`
     # what to start from: for lite0 the name of a model trained beside it, or one in data/weights, or a file, all of the
     # same network ("": ImageNet); for resnet34 a safetensors file of torchvision's ImageNet weights ("": random)
     trunk_weights: str = ""
@@ -131,7 +133,7 @@ class TrainConfig:
         _check_types(self)
         _check_object(self.object)
         _check_choice("method", self.method, METHODS)
-        _check_choice("network", self.network, ("lite0", "resnet34"))
+        _check_choice("network", self.network, NETWORKS)
         _check_choice("schedule", self.schedule, ("cosine", "step"))
         _set_frozen(self, "group", self.group or DEFAULT_GROUP.get(self.object, OWN_GROUP))
         weight = self.prototype_weight
@@ -199,8 +201,9 @@ class Preset:
         """The models of the main table by the names they have in it.
 
         The four methods differ in the loss and its margin alone. Beside them, "spcl_dense": SPCL with the dense
-        supervision that MMGSD gets; "mmgsd_plain": MMGSD without it; "mmgsd_long": MMGSD with `LONGER` times the steps;
-        "mmgsd_fine": that model after a quarter as many steps more, on larger images, with the method's own loss alone.
+        supervision that MMGSD gets; "mmgsd_plain": MMGSD without it; "mmgsd_deep": MMGSD in a network with a second
+        pass over its pyramid; "mmgsd_long": MMGSD with `LONGER` times the steps; "mmgsd_fine": the latter after a
+        quarter as many steps more, on larger images, with the method's own loss alone.
         """
         train = self.train[object]
         models = {method: dataclasses.replace(train, method=method) for method in METHODS}
@@ -211,6 +214,7 @@ class Preset:
         return models | {
             "spcl_dense": dataclasses.replace(models["spcl"], prototype_weight=1.0),
             "mmgsd_plain": dataclasses.replace(models["mmgsd"], prototype_weight=0.0),
+            "mmgsd_deep": dataclasses.replace(models["mmgsd"], network="lite0x2"),
             "mmgsd_long": longer,
             "mmgsd_fine": dataclasses.replace(longer, trunk_weights=longer.name, **finer, **gentler),
         }

@@ -30,7 +30,8 @@ from mmgsd.evaluation import (
 )
 from mmgsd.training import WEIGHTS, describe_run, train_model
 
-FIRST, LATER = ("mmgsd", "spcl"), ("unimodal", "pcl", "spcl_dense", "mmgsd_plain")  # before the studies, and after
+FIRST = ("mmgsd", "spcl")  # before the studies
+LATER = ("unimodal", "pcl", "spcl_dense", "mmgsd_plain", "mmgsd_deep")  # and after
 GROUPS = ("c4", "v4", "d4")
 VALIDATIONS = 8  # RMSE on held-out simulations, in a model's log
 

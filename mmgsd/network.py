@@ -12,18 +12,25 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from mmgsd.config import NETWORKS, PASSES
+
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 FROZEN_BLOCKS = 3  # of the trunk, and its stem, keep ImageNet's weights: a sixth of a step is saved
 TAPS = {2: 24, 4: 40, 10: 112, 15: 320}  # EfficientNet-Lite0: block after which a stride is complete -> channels
 
 
 class PyramidNetwork(nn.Module):
-    """EfficientNet-Lite0 trunk with a feature pyramid; (B, 3, H, W) in [0, 1] to (B, roles * D, H / 4, W / 4)."""
+    """EfficientNet-Lite0 trunk with a feature pyramid; (B, 3, H, W) in [0, 1] to (B, roles * D, H / 4, W / 4).
+
+    ``passes`` over the pyramid: the first upwards, each further one (`PyramidPass`) down and up again.
+    """
 
     stride = 4
     reduced_precision = True  # bfloat16 where that is faster
 
-    def __init__(self, descriptor_dim: int, *, roles: int = 1, width: int = 96, pretrained: bool = True) -> None:
+    def __init__(
+        self, descriptor_dim: int, *, roles: int = 1, passes: int = 1, width: int = 96, pretrained: bool = True
+    ) -> None:
         super().__init__()
         self.trunk = EfficientNet.from_name("efficientnet-lite0")
         if pretrained:
@@ -35,6 +42,7 @@ class PyramidNetwork(nn.Module):
         self.lateral = nn.ModuleList(nn.Conv2d(channels, width, 1) for channels in TAPS.values())
         self.merge = nn.ModuleList(_conv_block(width, width) for _ in TAPS)
         self.context = nn.Sequential(_conv_block(width, width), _conv_block(width, width))
+        self.again = nn.ModuleList(PyramidPass(width) for _ in range(passes - 1))
         self.head = _make_head(width, descriptor_dim, roles)
         _register_normalisation(self)
 
@@ -70,10 +78,34 @@ class PyramidNetwork(nn.Module):
 
     def _decode(self, features: list[Tensor]) -> Tensor:
         features = [lateral(f) for lateral, f in zip(self.lateral, features, strict=True)]
-        x = self.context(self.merge[-1](features[-1]))
+        levels = [self.context(self.merge[-1](features[-1]))]  # the coarsest first
         for feature, merge in zip(features[-2::-1], self.merge[-2::-1], strict=True):
-            x = merge(feature + F.interpolate(x, feature.shape[-2:], mode="bilinear", align_corners=False))
-        return x
+            levels.append(merge(feature + _resize(levels[-1], feature)))
+        for again in self.again:
+            levels = again(levels)
+        return levels[-1]
+
+
+class PyramidPass(nn.Module):
+    """A pyramid's levels, the finest down to the coarsest and up again: each place learns of all others once more.
+
+    As in stacked hourglass networks (Newell et al., ECCV 2016).
+    """
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.down = nn.ModuleList(_conv_block(width, width, stride=2) for _ in range(len(TAPS) - 1))
+        self.merge = nn.ModuleList(_conv_block(width, width) for _ in TAPS)
+
+    def forward(self, levels: list[Tensor]) -> list[Tensor]:
+        """Levels of (B, width, h, w), the coarsest first, to as many of the same shapes."""
+        passed = [levels[-1]]
+        for level, down in zip(levels[-2::-1], self.down, strict=True):
+            passed.append(level + _resize(down(passed[-1]), level))
+        risen = [self.merge[0](passed[-1])]
+        for level, merge in zip(passed[-2::-1], self.merge[1:], strict=True):
+            risen.append(merge(level + _resize(risen[-1], level)))
+        return [*risen[:-1], risen[-1] + levels[-1]]
 
 
 class TwoRoles(nn.Module):
@@ -172,18 +204,18 @@ class BasicBlock(nn.Module):
 def build_network(
     name: str, descriptor_dim: int, *, roles: int = 1, pretrained: bool = True, trunk_weights: Path | str = ""
 ) -> PyramidNetwork | ResNet34Network:
-    """The network ``lite0`` or ``resnet34`` with D channels for each of 1 or 2 roles; ValueError for another name.
+    """The network of a name in `NETWORKS` with D channels for each of 1 or 2 roles; ValueError for another name.
 
     ``pretrained`` starts lite0 from ImageNet; resnet34 does from the file ``trunk_weights`` where one is given.
     """
-    if name == "lite0":
-        return PyramidNetwork(descriptor_dim, roles=roles, pretrained=pretrained)
+    if name in PASSES:
+        return PyramidNetwork(descriptor_dim, roles=roles, passes=PASSES[name], pretrained=pretrained)
     if name == "resnet34":
         network = ResNet34Network(descriptor_dim, roles=roles)
         if pretrained and trunk_weights:
             network.load_trunk(trunk_weights)
         return network
-    raise ValueError(f"network must be 'lite0' or 'resnet34', got {name!r}")
+    raise ValueError(f"network must be one of {', '.join(map(repr, NETWORKS))}, got {name!r}")
 
 
 def compute_input_size(size: tuple[int, int], input_px: int) -> tuple[int, int]:
@@ -215,10 +247,13 @@ def _make_stage(inputs: int, outputs: int, blocks: int, *, stride: int = 1, dila
     return nn.Sequential(first, *(BasicBlock(outputs, outputs, 1, dilation) for _ in range(blocks - 1)))
 
 
-def _conv_block(inputs: int, outputs: int) -> nn.Sequential:
-    return nn.Sequential(
-        nn.Conv2d(inputs, outputs, 3, padding=1, bias=False), nn.BatchNorm2d(outputs), nn.ReLU(inplace=True)
-    )
+def _conv_block(inputs: int, outputs: int, *, stride: int = 1) -> nn.Sequential:
+    convolution = nn.Conv2d(inputs, outputs, 3, stride, padding=1, bias=False)
+    return nn.Sequential(convolution, nn.BatchNorm2d(outputs), nn.ReLU(inplace=True))
+
+
+def _resize(x: Tensor, like: Tensor) -> Tensor:
+    return F.interpolate(x, like.shape[-2:], mode="bilinear", align_corners=False)
 
 
 def _make_head(width: int, descriptor_dim: int, roles: int) -> nn.Module:

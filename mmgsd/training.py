@@ -25,7 +25,7 @@ from tqdm.auto import tqdm
 
 from mmgsd import distributed, losses
 from mmgsd.augmentation import Batch, load_training_images, make_batch
-from mmgsd.config import CONTRASTIVE, MATCHES_OF_ONE, TrainConfig, from_dict
+from mmgsd.config import CONTRASTIVE, MATCHES_OF_ONE, PASSES, TrainConfig, from_dict
 from mmgsd.dataset import Dataset, hold_out, load_dataset
 from mmgsd.evaluation import calibrate_bandwidth, calibrate_temperature, measure_rmse
 from mmgsd.matching import Matcher, load
@@ -320,7 +320,7 @@ def _make_network(config: TrainConfig, models: Path) -> torch.nn.Module:
     start, beside = config.trunk_weights, models / config.trunk_weights / WEIGHTS
     start = str(beside) if start and beside.is_file() else start
     network = build_network(config.network, config.descriptor_dim, roles=config.roles, trunk_weights=start)
-    if start and config.network == "lite0":  # of a model of ours; resnet34 has read torchvision's
+    if start and config.network in PASSES:  # of a model of ours; resnet34 has read torchvision's
         trained = load(start, device="cpu")
         for name in ("network", "descriptor_dim", "roles"):
             theirs, asked = getattr(trained.config, name), getattr(config, name)

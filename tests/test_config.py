@@ -89,7 +89,7 @@ def test_unknown_preset_names_the_accepted_ones() -> None:
         (TrainConfig, {"input_px": 32}, "input_px must be at least 64"),
         (TrainConfig, {"seed": -1}, "seed must be at least 0, got -1"),
         (TrainConfig, {"method": "mmgds"}, "method must be one of 'pcl', .*did you mean 'mmgsd'.*got 'mmgds'"),
-        (TrainConfig, {"network": "vgg"}, "network must be one of 'lite0', 'resnet34', got 'vgg'"),
+        (TrainConfig, {"network": "vgg"}, "network must be one of 'lite0', 'lite0x2', 'resnet34', got 'vgg'"),
         (TrainConfig, {"schedule": "none"}, "schedule must be one of 'cosine', 'step'"),
         (RenderConfig, {"train_images": 0}, "train_images must be at least 1"),
         (RenderConfig, {"rotation_deg": 181.0}, r"rotation_deg must be in \(0, 180\], got 181"),

@@ -27,10 +27,9 @@ def test_the_models_that_matter_most_come_first() -> None:
     order, steps = [m.method for m in models], [m.steps for m in models]
     assert models[4] == load_preset("paper").budget_table("cloth")["mmgsd"]  # one model, two tables
     assert max(i for i, m in enumerate(models) if m.sigma_px == 16) == max(i for i, n in enumerate(steps) if n == 1000)
-    assert set(steps[4:26]) == {1000} and set(steps[26:34] + steps[38:]) == {4000}
-    assert steps[34:38] == [12000] * 2 + [3000] * 2 and [m.trunk_weights for m in models[36:38]] == [
-        m.name for m in models[34:36]
-    ]  # what a model starts from comes before it
+    assert set(steps[4:28]) == {1000} and set(steps[28:38] + steps[42:]) == {4000}
+    assert steps[38:42] == [12000] * 2 + [3000] * 2
+    assert [m.trunk_weights for m in models[40:42]] == [m.name for m in models[38:40]]  # these are trained before
     assert order[-8:] == ["mmgsd", "mmgsd", "spcl", "spcl"] * 2
     assert len({m.name for m in models}) == len(models)
     assert {m.group for m in models if m.object == "cloth"} == {"c4", "v4", "d4"}

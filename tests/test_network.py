@@ -9,6 +9,7 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
+from mmgsd.config import NETWORKS
 from mmgsd.network import (
     ResNet34Trunk,
     build_network,
@@ -48,7 +49,7 @@ def test_resnet34_has_torchvisions_shapes() -> None:
 
 @pytest.mark.parametrize(("height", "width"), [(64, 64), (64, 96), (61, 75)])
 @pytest.mark.parametrize("roles", [1, 2])
-@pytest.mark.parametrize(("name", "stride"), [("lite0", 4), ("resnet34", 1)])
+@pytest.mark.parametrize(("name", "stride"), [("lite0", 4), ("lite0x2", 4), ("resnet34", 1)])
 def test_output_shape(name: str, stride: int, roles: int, height: int, width: int) -> None:
     network = build_network(name, 5, roles=roles, pretrained=False).eval()
     with torch.no_grad():
@@ -57,7 +58,7 @@ def test_output_shape(name: str, stride: int, roles: int, height: int, width: in
     assert descriptors.dtype == torch.float32
 
 
-@pytest.mark.parametrize("name", ["lite0", "resnet34"])
+@pytest.mark.parametrize("name", NETWORKS)
 def test_every_used_parameter_gets_a_gradient(name: str) -> None:
     network = build_network(name, 4, pretrained=False)
     network(torch.rand(2, 3, 64, 64)).square().sum().backward()
@@ -92,7 +93,7 @@ def test_weights_of_something_else_are_named(tmp_path: Path) -> None:
 
 
 def test_unknown_network() -> None:
-    with pytest.raises(ValueError, match="network must be 'lite0' or 'resnet34', got 'vgg'"):
+    with pytest.raises(ValueError, match="network must be one of 'lite0', 'lite0x2', 'resnet34', got 'vgg'"):
         build_network("vgg", 3)
 
 
