@@ -15,7 +15,7 @@ from mmgsd.config import LONGER
 PAPER = {"cloth": 32.4, "rope": 31.3}  # px, MMGSD's RMSE as the paper reports it
 LABELS = {
     "mmgsd": "**MMGSD** (ours)", "mmgsd_deep": "MMGSD, deeper network", "mmgsd_long": f"MMGSD, {LONGER} × the steps",
-    "mmgsd_fine": f"MMGSD, {LONGER} × the steps, then larger images", "mmgsd_plain": "MMGSD, own loss alone",
+    "mmgsd_fine": "MMGSD, then larger images", "mmgsd_plain": "MMGSD, own loss alone",
     "spcl_dense": "SPCL, dense supervision", "spcl": "SPCL", "unimodal": "Unimodal", "pcl": "PCL",
     "sift": "SIFT", "orb": "ORB", "akaze": "AKAZE", "daisy": "DAISY", "surf": "SURF",
     "random": "random points", "centre": "object's centre",
