@@ -29,8 +29,8 @@ PASSES = {"lite0": 1, "lite0x2": 2}  # over the feature pyramid
 NETWORKS = (*PASSES, "resnet34")  # the last is the contrastive papers' reference
 CONTRASTIVE_MARGIN = 4.0  # of the presets: with the reference's 0.5, lite0's descriptors collapse before they learn
 LONGER = 3  # times the steps of the main table: a model of its own, to see what more training gains
-LONGER_TRAINED = ("mmgsd_long", "mmgsd_fine")
-FINER = 1.5  # times the input, at least, on which that one is then trained further: another
+FINER = 1.5  # times the input, at least, on which another goes on from there
+LONGER_TRAINED = ("mmgsd_long", "mmgsd_fine")  # these two
 N_POINTS = 625  # material points of the cloth and the rope
 
 Config = TypeVar("Config", bound="RenderConfig | TrainConfig | EvaluateConfig")
