@@ -201,9 +201,10 @@ class Preset:
         """The models of the main table by the names they have in it.
 
         The four methods differ in the loss and its margin alone. Beside them, "spcl_dense": SPCL with the dense
-        supervision that MMGSD gets; "mmgsd_plain": MMGSD without it; "mmgsd_deep": MMGSD in a network with a second
-        pass over its pyramid; "mmgsd_long": MMGSD with `LONGER` times the steps; "mmgsd_fine": the latter after a
-        quarter as many steps more, on larger images, with the method's own loss alone.
+        supervision that MMGSD gets; "mmgsd_plain": MMGSD without it; "mmgsd_deep" and "spcl_deep": MMGSD, and SPCL
+        with the dense supervision, in a network with a second pass over its pyramid; "mmgsd_long": MMGSD with `LONGER`
+        times the steps; "mmgsd_fine": the latter after a quarter as many steps more, on larger images, with the
+        method's own loss alone.
         """
         train = self.train[object]
         models = {method: dataclasses.replace(train, method=method) for method in METHODS}
@@ -215,6 +216,7 @@ class Preset:
             "spcl_dense": dataclasses.replace(models["spcl"], prototype_weight=1.0),
             "mmgsd_plain": dataclasses.replace(models["mmgsd"], prototype_weight=0.0),
             "mmgsd_deep": dataclasses.replace(models["mmgsd"], network="lite0x2"),
+            "spcl_deep": dataclasses.replace(models["spcl"], prototype_weight=1.0, network="lite0x2"),
             "mmgsd_long": longer,
             "mmgsd_fine": dataclasses.replace(longer, trunk_weights=longer.name, **finer, **gentler),
         }

@@ -31,7 +31,7 @@ from mmgsd.evaluation import (
 from mmgsd.training import WEIGHTS, describe_run, train_model
 
 FIRST = ("mmgsd", "spcl")  # before the studies
-LATER = ("unimodal", "pcl", "spcl_dense", "mmgsd_plain", "mmgsd_deep")  # and after
+LATER = ("unimodal", "pcl", "spcl_dense", "mmgsd_plain", "mmgsd_deep", "spcl_deep")  # and after
 GROUPS = ("c4", "v4", "d4")
 VALIDATIONS = 8  # RMSE on held-out simulations, in a model's log
 

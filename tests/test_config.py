@@ -62,6 +62,9 @@ def test_any_model_of_the_main_table_is_found_by_its_name() -> None:
     finer = preset.method("rope", "mmgsd_fine")
     assert finer.trunk_weights == preset.method("rope", "mmgsd_long").name and finer.input_px == 192
     assert preset.method("cloth", "spcl_dense").dense_weight == 1
+    deep = preset.method("cloth", "spcl_deep")
+    assert dataclasses.replace(deep, network="lite0") == preset.method("cloth", "spcl_dense")
+    assert deep.network == preset.method("cloth", "mmgsd_deep").network
     with pytest.raises(ValueError, match="method must be one of 'pcl', .*'mmgsd_long'.*got 'mmgsd_lang'"):
         preset.method("cloth", "mmgsd_lang")
 

@@ -27,15 +27,15 @@ def test_the_models_that_matter_most_come_first() -> None:
     order, steps = [m.method for m in models], [m.steps for m in models]
     assert models[4] == load_preset("paper").budget_table("cloth")["mmgsd"]  # one model, two tables
     assert max(i for i, m in enumerate(models) if m.sigma_px == 16) == max(i for i, n in enumerate(steps) if n == 1000)
-    assert set(steps[4:28]) == {1000} and set(steps[28:38] + steps[42:]) == {4000}
-    assert steps[38:42] == [12000] * 2 + [3000] * 2
-    assert [m.trunk_weights for m in models[40:42]] == [m.name for m in models[38:40]]  # these are trained before
+    assert set(steps[4:30]) == {1000} and set(steps[30:42] + steps[46:]) == {4000}
+    assert steps[42:46] == [12000] * 2 + [3000] * 2
+    assert [m.trunk_weights for m in models[44:46]] == [m.name for m in models[42:44]]  # these are trained before
     assert order[-8:] == ["mmgsd", "mmgsd", "spcl", "spcl"] * 2
     assert len({m.name for m in models}) == len(models)
     assert {m.group for m in models if m.object == "cloth"} == {"c4", "v4", "d4"}
     assert sorted({m.sigma_px for m in models}) == [1.0, 2.0, 4.0, 8.0, 16.0]
     assert {m.seed for m in models if m.method == "mmgsd"} == {0, 1, 2}
-    assert sum(m.method == "spcl" and m.dense_weight == 1.0 for m in models) == 4
+    assert sum(m.method == "spcl" and m.dense_weight == 1.0 for m in models) == 8
     assert sum(m.method == "mmgsd" and m.dense_weight == 0.0 for m in models) == 6
 
 
@@ -88,8 +88,8 @@ def test_some_can_be_chosen_by_name(monkeypatch: pytest.MonkeyPatch, capsys: pyt
     monkeypatch.setattr(matrix, "run_tasks", lambda tasks, *_, **__: asked.extend(tasks) or iter(()))
     monkeypatch.setattr("sys.argv", ["mmgsd.matrix", "paper", "--only", "rope-spcl"])
     matrix.main()
-    assert [(m.object, m.method) for m in asked] == [("rope", "spcl")] * 4
-    assert [m.steps for m in asked] == [4000, 1000, 1000, 4000]
+    assert [(m.object, m.method) for m in asked] == [("rope", "spcl")] * 6
+    assert [m.steps for m in asked] == [4000, 1000, 1000, 1000, 4000, 4000]
     monkeypatch.setattr("sys.argv", ["mmgsd.matrix", "paper", "--only", "shirt"])
     with pytest.raises(SystemExit):
         matrix.main()
