@@ -30,7 +30,7 @@ NETWORKS = (*PASSES, "resnet34")  # the last is the contrastive papers' referenc
 CONTRASTIVE_MARGIN = 4.0  # of the presets: with the reference's 0.5, lite0's descriptors collapse before they learn
 LONGER = 3  # times the steps of the main table: a model of its own, to see what more training gains
 FINER = 1.5  # times the input, at least, on which another goes on from there
-LONGER_TRAINED = ("mmgsd_long", "mmgsd_fine")  # these two
+LONGER_TRAINED = ("mmgsd_long", "mmgsd_fine", "mmgsd_fine_deep")  # these, and one that goes on from both
 N_POINTS = 625  # material points of the cloth and the rope
 
 Config = TypeVar("Config", bound="RenderConfig | TrainConfig | EvaluateConfig")
@@ -105,8 +105,8 @@ class TrainConfig:
     method: str = "mmgsd"
     group: str = ""  # symmetry group the matches come from; "" is the object's own (c4, c2, or its file's)
     network: str = "lite0"  # or another of `NETWORKS`
-    # what to start from: for lite0 the name of a model trained beside it, or one in data/weights, or a file, all of the
-    # same network ("": ImageNet); for resnet34 a safetensors file of torchvision's ImageNet weights ("": random)
+    # what to start from: for lite0 and lite0x2 a file, or the name of a model trained beside it or in data/weights, of
+    # as many passes or fewer ("": ImageNet); for resnet34 torchvision's ImageNet weights as safetensors ("": random)
     trunk_weights: str = ""
     descriptor_dim: int = 32
     roles: int = 1  # 2: a pixel that is asked about and one that answers have descriptors of their own
@@ -204,7 +204,7 @@ class Preset:
         supervision that MMGSD gets; "mmgsd_plain": MMGSD without it; "mmgsd_deep" and "spcl_deep": MMGSD, and SPCL
         with the dense supervision, in a network with a second pass over its pyramid; "mmgsd_long": MMGSD with `LONGER`
         times the steps; "mmgsd_fine": the latter after a quarter as many steps more, on larger images, with the
-        method's own loss alone.
+        method's own loss alone; "mmgsd_fine_deep": that one after as many again, with the second pass put onto it.
         """
         train = self.train[object]
         models = {method: dataclasses.replace(train, method=method) for method in METHODS}
@@ -212,13 +212,15 @@ class Preset:
         longer = dataclasses.replace(models["mmgsd"], steps=LONGER * train.steps)
         finer = {"input_px": math.ceil(FINER * train.input_px / 32) * 32, "steps": max(1, longer.steps // 4)}
         gentler = {"learning_rate": train.learning_rate / 2, "sigma_start_px": 8.0, "prototype_weight": 0.0}
+        fine = dataclasses.replace(longer, trunk_weights=longer.name, **finer, **gentler)
         return models | {
             "spcl_dense": dataclasses.replace(models["spcl"], prototype_weight=1.0),
             "mmgsd_plain": dataclasses.replace(models["mmgsd"], prototype_weight=0.0),
             "mmgsd_deep": dataclasses.replace(models["mmgsd"], network="lite0x2"),
             "spcl_deep": dataclasses.replace(models["spcl"], prototype_weight=1.0, network="lite0x2"),
             "mmgsd_long": longer,
-            "mmgsd_fine": dataclasses.replace(longer, trunk_weights=longer.name, **finer, **gentler),
+            "mmgsd_fine": fine,
+            "mmgsd_fine_deep": dataclasses.replace(fine, trunk_weights=fine.name, network="lite0x2"),
         }
 
     def budget_table(self, object: str) -> dict[str, TrainConfig]:

@@ -65,7 +65,7 @@ def run_task(
 ) -> tuple[str, float]:
     """Train a model and ask it the preset's questions, or ask a baseline, unless that is done; name and RMSE (px).
 
-    A model of the preset that it starts from is trained first; ``after`` is that one's result, to be waited for.
+    Models of the preset that it starts from are trained first; ``after`` is the last one's result, to be waited for.
     """
     paths, name = Paths(root, preset.name), name_task(task)
     if isinstance(task, TrainConfig):
@@ -83,9 +83,10 @@ def run_task(
 
 
 def _find_start(task: Task, preset: Preset) -> list[TrainConfig]:
-    """The model of the preset that a task starts from, if it does from one."""
+    """The models of the preset that a task starts from, if it does: each from the one before it."""
     start = task.trunk_weights if isinstance(task, TrainConfig) else ""
-    return [model for model in list_models(preset) if model.name == start]
+    found = [model for model in list_models(preset) if model.name == start]
+    return [*_find_start(found[0], preset), *found] if found else []
 
 
 def run_tasks(tasks: list[Task], preset: Preset, root: Path, *, scheduler: str = "") -> Iterator[tuple]:
@@ -99,7 +100,7 @@ def run_tasks(tasks: list[Task], preset: Preset, root: Path, *, scheduler: str =
     with Client(scheduler) as client:
         futures = {}
         for i, task in enumerate(tasks):
-            after = next((futures.get(start.name) for start in _find_start(task, preset)), None)
+            after = next((futures.get(start.name) for start in reversed(_find_start(task, preset))), None)
             futures[name_task(task)] = client.submit(run_task, task, preset, root, after, pure=False, priority=-i)
         yield from (future.result() for future in as_completed(futures.values()))
 

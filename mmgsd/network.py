@@ -14,6 +14,7 @@ from torch.nn import functional as F
 
 from mmgsd.config import NETWORKS, PASSES
 
+QUIET = 0.1  # scale of what a pass adds that is put onto trained ones: their answers hardly change at first
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 FROZEN_BLOCKS = 3  # of the trunk, and its stem, keep ImageNet's weights: a sixth of a step is saved
 TAPS = {2: 24, 4: 40, 10: 112, 15: 320}  # EfficientNet-Lite0: block after which a stride is complete -> channels
@@ -53,6 +54,14 @@ class PyramidNetwork(nn.Module):
             if isinstance(module, nn.BatchNorm2d):
                 module.eval()
         return self
+
+    def start_from(self, other: PyramidNetwork) -> None:
+        """Take the weights of a network with as many passes or fewer; ValueError for one with more."""
+        if len(other.again) > len(self.again):
+            raise ValueError(f"other must have at most {len(self.again) + 1} passes, got {len(other.again) + 1}")
+        for added in self.again[len(other.again) :]:
+            torch.nn.init.constant_(added.merge[-1][1].weight, QUIET)
+        self.load_state_dict({**self.state_dict(), **other.state_dict()})
 
     def forward(self, image: Tensor) -> Tensor:
         """Dense descriptors, not normalised: their distance carries the temperature."""

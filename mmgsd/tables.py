@@ -15,7 +15,8 @@ from mmgsd.config import LONGER
 PAPER = {"cloth": 32.4, "rope": 31.3}  # px, MMGSD's RMSE as the paper reports it
 LABELS = {
     "mmgsd": "**MMGSD** (ours)", "mmgsd_deep": "MMGSD, deeper network", "mmgsd_long": f"MMGSD, {LONGER} × the steps",
-    "mmgsd_fine": "MMGSD, then larger images", "mmgsd_plain": "MMGSD, own loss alone",
+    "mmgsd_fine": "MMGSD, then larger images", "mmgsd_fine_deep": "MMGSD, then deeper network",
+    "mmgsd_plain": "MMGSD, own loss alone",
     "spcl_deep": "SPCL, dense, deeper network", "spcl_dense": "SPCL, dense supervision", "spcl": "SPCL",
     "unimodal": "Unimodal", "pcl": "PCL",
     "sift": "SIFT", "orb": "ORB", "akaze": "AKAZE", "daisy": "DAISY", "surf": "SURF",

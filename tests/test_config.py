@@ -61,6 +61,9 @@ def test_any_model_of_the_main_table_is_found_by_its_name() -> None:
     assert preset.method("rope", "mmgsd_long").steps == LONGER * preset.method("rope", "mmgsd").steps
     finer = preset.method("rope", "mmgsd_fine")
     assert finer.trunk_weights == preset.method("rope", "mmgsd_long").name and finer.input_px == 192
+    deeper = preset.method("rope", "mmgsd_fine_deep")
+    assert dataclasses.replace(deeper, network="lite0", trunk_weights=finer.trunk_weights) == finer
+    assert deeper.trunk_weights == finer.name
     assert preset.method("cloth", "spcl_dense").dense_weight == 1
     deep = preset.method("cloth", "spcl_deep")
     assert dataclasses.replace(deep, network="lite0") == preset.method("cloth", "spcl_dense")

@@ -11,7 +11,7 @@ import pytest
 from dask.distributed import LocalCluster
 
 from mmgsd import matrix
-from mmgsd.config import Preset, load_preset
+from mmgsd.config import LONGER_TRAINED, Preset, load_preset
 from mmgsd.evaluation import write_results
 from mmgsd.matrix import list_models, list_tasks, run_tasks, write_sigma_table, write_tables
 
@@ -27,16 +27,16 @@ def test_the_models_that_matter_most_come_first() -> None:
     order, steps = [m.method for m in models], [m.steps for m in models]
     assert models[4] == load_preset("paper").budget_table("cloth")["mmgsd"]  # one model, two tables
     assert max(i for i, m in enumerate(models) if m.sigma_px == 16) == max(i for i, n in enumerate(steps) if n == 1000)
-    assert set(steps[4:30]) == {1000} and set(steps[30:42] + steps[46:]) == {4000}
-    assert steps[42:46] == [12000] * 2 + [3000] * 2
-    assert [m.trunk_weights for m in models[44:46]] == [m.name for m in models[42:44]]  # these are trained before
+    assert set(steps[4:30]) == {1000} and set(steps[30:42] + steps[48:]) == {4000}
+    assert steps[42:48] == [12000] * 2 + [3000] * 4
+    assert [m.trunk_weights for m in models[44:48]] == [m.name for m in models[42:46]]  # these are trained before
     assert order[-8:] == ["mmgsd", "mmgsd", "spcl", "spcl"] * 2
     assert len({m.name for m in models}) == len(models)
     assert {m.group for m in models if m.object == "cloth"} == {"c4", "v4", "d4"}
     assert sorted({m.sigma_px for m in models}) == [1.0, 2.0, 4.0, 8.0, 16.0]
     assert {m.seed for m in models if m.method == "mmgsd"} == {0, 1, 2}
     assert sum(m.method == "spcl" and m.dense_weight == 1.0 for m in models) == 8
-    assert sum(m.method == "mmgsd" and m.dense_weight == 0.0 for m in models) == 6
+    assert sum(m.method == "mmgsd" and m.dense_weight == 0.0 for m in models) == 8
 
 
 def test_baselines_come_before_the_studies() -> None:
@@ -125,11 +125,11 @@ def test_what_a_model_starts_from_is_trained_before_it(tiny_dataset: Callable[..
     preset = make_tiny(tiny_dataset, tmp_path)
     train = {"cloth": dataclasses.replace(preset.train["cloth"], steps=1, input_px=64), "rope": preset.train["rope"]}
     preset = dataclasses.replace(preset, train=train)
-    longer, finer = (preset.method("cloth", method) for method in ("mmgsd_long", "mmgsd_fine"))
+    longer, finer, deeper = (preset.method("cloth", method) for method in LONGER_TRAINED)
     models = tmp_path / "data" / "generated" / "smoke" / "models"
-    (_, rmse), *_ = run_tasks([finer], preset, tmp_path)
-    assert all((models / model.name / "weights.safetensors").is_file() for model in (longer, finer))
+    (_, rmse), *_ = run_tasks([deeper], preset, tmp_path)
+    assert all((models / model.name / "weights.safetensors").is_file() for model in (longer, finer, deeper))
     how = {"n_workers": 2, "threads_per_worker": 1, "processes": False, "dashboard_address": "127.0.0.1:0"}
     with LocalCluster(**how, silence_logs="ERROR") as cluster:
-        there = dict(run_tasks([longer, finer], preset, tmp_path, scheduler=cluster.scheduler_address))
-    assert there[finer.name] == rmse
+        there = dict(run_tasks([longer, finer, deeper], preset, tmp_path, scheduler=cluster.scheduler_address))
+    assert there[deeper.name] == rmse

@@ -65,6 +65,25 @@ def test_every_used_parameter_gets_a_gradient(name: str) -> None:
     assert [n for n, p in network.named_parameters() if p.grad is None] == []
 
 
+def test_a_pass_put_onto_trained_ones_hardly_changes_their_answers() -> None:
+    torch.manual_seed(0)
+    trained = build_network("lite0", 4, roles=2).eval()
+    deeper = build_network("lite0x2", 4, roles=2, pretrained=False).eval()
+    deeper.start_from(trained)
+    image = torch.rand(1, 3, 64, 64)
+    with torch.no_grad():
+        before, after = trained(image), deeper(image)
+    gap = (after - before).std() / before.std()
+    assert 0 < gap < 0.2
+    assert all(torch.equal(deeper.state_dict()[name], value) for name, value in trained.state_dict().items())
+
+
+def test_a_pass_is_not_dropped() -> None:
+    deeper = build_network("lite0x2", 4, pretrained=False)
+    with pytest.raises(ValueError, match="other must have at most 1 passes, got 2"):
+        build_network("lite0", 4, pretrained=False).start_from(deeper)
+
+
 def write_torchvision_weights(path: Path) -> dict[str, Tensor]:
     """A file as torchvision's: the trunk, and a classifier that is not used."""
     torch.manual_seed(3)

@@ -155,6 +155,16 @@ def test_training_starts_from_trained_weights(cloth_dataset: Path, tmp_path: Pat
             torch.testing.assert_close(went_on[name], value, rtol=0, atol=1e-6)
 
 
+def test_a_deeper_network_starts_from_a_shallower_one(cloth_dataset: Path, tmp_path: Path) -> None:
+    shallow = train(ONE_STEP, cloth_dataset, tmp_path / "shallow")
+    config = dataclasses.replace(ONE_STEP, network="lite0x2", trunk_weights="shallow", learning_rate=1e-9)
+    deep = load_file(train(config, cloth_dataset, tmp_path / "deep"))
+    torch.testing.assert_close(deep["head.weight"], load_file(shallow)["head.weight"], rtol=0, atol=1e-6)
+    back = dataclasses.replace(ONE_STEP, trunk_weights="deep")
+    with pytest.raises(ValueError, match="trunk_weights .* has network 'lite0x2', the training 'lite0'"):
+        train(back, cloth_dataset, tmp_path / "back")
+
+
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [
