@@ -30,7 +30,7 @@ NETWORKS = (*PASSES, "resnet34")  # the last is the contrastive papers' referenc
 CONTRASTIVE_MARGIN = 4.0  # of the presets: with the reference's 0.5, lite0's descriptors collapse before they learn
 LONGER = 3  # times the steps of the main table: a model of its own, to see what more training gains
 FINER = 1.5  # times the input, at least, on which another goes on from there
-LONGER_TRAINED = ("mmgsd_long", "mmgsd_fine", "mmgsd_fine_deep")  # these, and one that goes on from both
+LONGER_TRAINED = ("mmgsd_long", "mmgsd_fine", "mmgsd_fine_deep")  # these two, and one that goes on from them
 N_POINTS = 625  # material points of the cloth and the rope
 
 Config = TypeVar("Config", bound="RenderConfig | TrainConfig | EvaluateConfig")
