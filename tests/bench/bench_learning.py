@@ -51,12 +51,15 @@ def measure_pace(config: TrainConfig, dataset: Path) -> float:
 
 
 def record(row: dict[str, object], path: Path) -> None:
-    """Append a row to the log of experiments."""
+    """Append a row to the log of experiments, unless the same run is there already."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    new = not path.is_file()
+    rows = list(csv.DictReader(path.read_text().splitlines())) if path.is_file() else []
+    when = ("date", "commit")
+    if any(all(old[name] == str(value) for name, value in row.items() if name not in when) for old in rows):
+        return
     with path.open("a", newline="") as file:
         writer = csv.DictWriter(file, row)
-        if new:
+        if not rows:
             writer.writeheader()
         writer.writerow(row)
 
