@@ -31,6 +31,11 @@ CONTRASTIVE_MARGIN = 4.0  # of the presets: with the reference's 0.5, lite0's de
 LONGER = 3  # times the steps of the main table: a model of its own, to see what more training gains
 FINER = 1.5  # times the input, at least, on which another goes on from there
 LONGER_TRAINED = ("mmgsd_long", "mmgsd_fine", "mmgsd_fine_deep")  # these two, and one that goes on from them
+REFERENCE = {  # Dense Object Nets' training (Florence et al. 2018): 3,500 steps of a pair of images as they are
+    "network": "resnet34", "descriptor_dim": 3, "roles": 1, "batch": 2, "pairs": 1, "queries": 625, "margin": 0.5,
+    "learning_rate": 1e-4, "schedule": "step", "weight_decay": 1e-4, "bend": 0.0, "augment": False,
+}  # fmt: skip
+OWN_STEPS = ("spcl_reference", *LONGER_TRAINED)  # models of the main table with another number of steps than the rest
 N_POINTS = 625  # material points of the cloth and the rope
 
 Config = TypeVar("Config", bound="RenderConfig | TrainConfig | EvaluateConfig")
@@ -201,14 +206,17 @@ class Preset:
         """The models of the main table by the names they have in it.
 
         The four methods differ in the loss and its margin alone. Beside them, "spcl_dense": SPCL with the dense
-        supervision that MMGSD gets; "mmgsd_plain": MMGSD without it; "mmgsd_deep" and "spcl_deep": MMGSD, and SPCL
-        with the dense supervision, in a network with a second pass over its pyramid; "mmgsd_long": MMGSD with `LONGER`
-        times the steps; "mmgsd_fine": the latter after a quarter as many steps more, on larger images, with the
-        method's own loss alone; "mmgsd_fine_deep": that one after as many again, with the second pass put onto it.
+        supervision that MMGSD gets; "spcl_reference": SPCL as Dense Object Nets are trained (`REFERENCE`), its images
+        twice as large for cells of the same size; "mmgsd_plain": MMGSD without the dense supervision; "mmgsd_deep" and
+        "spcl_deep": MMGSD, and SPCL with the dense supervision, in a network with a second pass over its pyramid;
+        "mmgsd_long": MMGSD with `LONGER` times the steps; "mmgsd_fine": the latter after a quarter as many steps more,
+        on larger images, with the method's own loss alone; "mmgsd_fine_deep": that one after as many again, with the
+        second pass put onto it.
         """
         train = self.train[object]
         models = {method: dataclasses.replace(train, method=method) for method in METHODS}
         models |= {m: dataclasses.replace(models[m], margin=CONTRASTIVE_MARGIN) for m in CONTRASTIVE}
+        reference = {"input_px": 2 * train.input_px, "steps": max(1, train.steps * 7 // 8), **REFERENCE}
         longer = dataclasses.replace(models["mmgsd"], steps=LONGER * train.steps)
         finer = {"input_px": math.ceil(FINER * train.input_px / 32) * 32, "steps": max(1, longer.steps // 4)}
         gentler = {"learning_rate": train.learning_rate / 2, "sigma_start_px": 8.0, "prototype_weight": 0.0}
@@ -218,15 +226,16 @@ class Preset:
             "mmgsd_plain": dataclasses.replace(models["mmgsd"], prototype_weight=0.0),
             "mmgsd_deep": dataclasses.replace(models["mmgsd"], network="lite0x2"),
             "spcl_deep": dataclasses.replace(models["spcl"], prototype_weight=1.0, network="lite0x2"),
+            "spcl_reference": dataclasses.replace(train, method="spcl", **reference),
             "mmgsd_long": longer,
             "mmgsd_fine": fine,
             "mmgsd_fine_deep": dataclasses.replace(fine, trunk_weights=fine.name, network="lite0x2"),
         }
 
     def budget_table(self, object: str) -> dict[str, TrainConfig]:
-        """The same models at the smaller budget of the studies, which is one: without those trained longer."""
+        """The same models at the smaller budget of the studies, which is one: without those of their own number."""
         models = dataclasses.replace(self, train=self.ablation).main_table(object)
-        return {method: model for method, model in models.items() if method not in LONGER_TRAINED}
+        return {method: model for method, model in models.items() if method not in OWN_STEPS}
 
     def sigma_table(self, object: str, sigmas_px: Sequence[float] = (), *, steps: int = 0) -> dict[str, TrainConfig]:
         """MMGSD with each σ, of the preset where ``sigmas_px`` names none: {"4": …}; 0 ``steps`` are that budget's."""

@@ -18,7 +18,7 @@ from pathlib import Path
 from dask.distributed import Client, as_completed
 from tqdm.auto import tqdm
 
-from mmgsd.config import LONGER_TRAINED, OBJECTS, Paths, Preset, TrainConfig, find_root, load_preset
+from mmgsd.config import OBJECTS, OWN_STEPS, Paths, Preset, TrainConfig, find_root, load_preset
 from mmgsd.evaluation import (
     BASELINES,
     CHANCE,
@@ -40,7 +40,7 @@ Task = TrainConfig | tuple[str, str]  # a model to train and ask, or an object a
 
 def list_models(preset: Preset, *, seeds: int = 1) -> list[TrainConfig]:
     """MMGSD and SPCL, the studies' models (symmetry, methods, σ), the rest of the main table, and further seeds."""
-    main, last = {name: preset.main_table(name) for name in OBJECTS}, (*LATER, *LONGER_TRAINED)
+    main, last = {name: preset.main_table(name) for name in OBJECTS}, (*LATER, *OWN_STEPS)
     first, later = ([main[name][method] for method in methods for name in OBJECTS] for methods in (FIRST, last))
     budget = [preset.budget_table(name)[m] for m in (*FIRST, *LATER) for name in OBJECTS]
     groups = [dataclasses.replace(preset.ablation["cloth"], group=group) for group in GROUPS]

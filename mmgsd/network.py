@@ -134,12 +134,13 @@ class TwoRoles(nn.Module):
 
 
 class ResNet34Network(nn.Module):
-    """ResNet-34 with output stride 8, upsampled to the input's size (Dense Object Nets, Florence et al. 2018).
+    """ResNet-34 with output stride 8, upsampled (Dense Object Nets, Florence et al. 2018) to the pyramid's stride.
 
+    Not to the input's: places are read between cells bilinearly anyway, and each answer would take 16 times as long.
     The trunk's parameters bear torchvision's names; `load_trunk` reads an ImageNet state dict into it.
     """
 
-    stride = 1
+    stride = 4
     reduced_precision = True
 
     def __init__(self, descriptor_dim: int, *, roles: int = 1) -> None:
@@ -149,10 +150,11 @@ class ResNet34Network(nn.Module):
         _register_normalisation(self)
 
     def forward(self, image: Tensor) -> Tensor:
-        """(B, 3, H, W) in [0, 1] to (B, roles * D, H, W)."""
+        """(B, 3, H, W) in [0, 1] to (B, roles * D, H / 4, W / 4)."""
         with torch.autocast(image.device.type, torch.bfloat16, enabled=self.reduced_precision):
             x = self.trunk((image - self.mean) / self.std)  # (B, 512, H / 8, W / 8)
-        return F.interpolate(self.head(x.float()), image.shape[-2:], mode="bilinear", align_corners=False)
+        size = [side // self.stride for side in image.shape[-2:]]
+        return F.interpolate(self.head(x.float()), size, mode="bilinear", align_corners=False)
 
     def load_trunk(self, path: Path | str) -> None:
         """Read ImageNet weights of torchvision's ResNet-34 (safetensors); its classifier ``fc.*`` is left out.

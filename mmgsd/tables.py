@@ -18,6 +18,7 @@ LABELS = {
     "mmgsd_fine": "MMGSD, then larger images", "mmgsd_fine_deep": "MMGSD, then deeper network",
     "mmgsd_plain": "MMGSD, own loss alone",
     "spcl_deep": "SPCL, dense, deeper network", "spcl_dense": "SPCL, dense supervision", "spcl": "SPCL",
+    "spcl_reference": "SPCL, reference setting",
     "unimodal": "Unimodal", "pcl": "PCL",
     "sift": "SIFT", "orb": "ORB", "akaze": "AKAZE", "daisy": "DAISY", "surf": "SURF",
     "random": "random points", "centre": "object's centre",

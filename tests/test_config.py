@@ -68,6 +68,8 @@ def test_any_model_of_the_main_table_is_found_by_its_name() -> None:
     deep = preset.method("cloth", "spcl_deep")
     assert dataclasses.replace(deep, network="lite0") == preset.method("cloth", "spcl_dense")
     assert deep.network == preset.method("cloth", "mmgsd_deep").network
+    reference = load_preset("paper").method("rope", "spcl_reference")
+    assert (reference.steps, reference.margin, reference.network, reference.input_px) == (3500, 0.5, "resnet34", 320)
     with pytest.raises(ValueError, match="method must be one of 'pcl', .*'mmgsd_long'.*got 'mmgsd_lang'"):
         preset.method("cloth", "mmgsd_lang")
 

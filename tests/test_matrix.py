@@ -27,9 +27,9 @@ def test_the_models_that_matter_most_come_first() -> None:
     order, steps = [m.method for m in models], [m.steps for m in models]
     assert models[4] == load_preset("paper").budget_table("cloth")["mmgsd"]  # one model, two tables
     assert max(i for i, m in enumerate(models) if m.sigma_px == 16) == max(i for i, n in enumerate(steps) if n == 1000)
-    assert set(steps[4:30]) == {1000} and set(steps[30:42] + steps[48:]) == {4000}
-    assert steps[42:48] == [12000] * 2 + [3000] * 4
-    assert [m.trunk_weights for m in models[44:48]] == [m.name for m in models[42:46]]  # these are trained before
+    assert set(steps[4:30]) == {1000} and set(steps[30:42] + steps[50:]) == {4000}
+    assert steps[42:50] == [3500] * 2 + [12000] * 2 + [3000] * 4
+    assert [m.trunk_weights for m in models[46:50]] == [m.name for m in models[44:48]]  # these are trained before
     assert order[-8:] == ["mmgsd", "mmgsd", "spcl", "spcl"] * 2
     assert len({m.name for m in models}) == len(models)
     assert {m.group for m in models if m.object == "cloth"} == {"c4", "v4", "d4"}
