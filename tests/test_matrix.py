@@ -88,8 +88,8 @@ def test_some_can_be_chosen_by_name(monkeypatch: pytest.MonkeyPatch, capsys: pyt
     monkeypatch.setattr(matrix, "run_tasks", lambda tasks, *_, **__: asked.extend(tasks) or iter(()))
     monkeypatch.setattr("sys.argv", ["mmgsd.matrix", "paper", "--only", "rope-spcl"])
     matrix.main()
-    assert [(m.object, m.method) for m in asked] == [("rope", "spcl")] * 6
-    assert [m.steps for m in asked] == [4000, 1000, 1000, 1000, 4000, 4000]
+    assert [(m.object, m.method) for m in asked] == [("rope", "spcl")] * 7
+    assert [m.steps for m in asked] == [4000, 1000, 1000, 1000, 4000, 4000, 3500]
     monkeypatch.setattr("sys.argv", ["mmgsd.matrix", "paper", "--only", "shirt"])
     with pytest.raises(SystemExit):
         matrix.main()
