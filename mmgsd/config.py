@@ -244,6 +244,12 @@ class Preset:
         models = {sigma: dataclasses.replace(budget, sigma_px=sigma, steps=steps or budget.steps) for sigma in chosen}
         return {f"{sigma:g}": model for sigma, model in models.items()}
 
+    def seed_table(self, object: str, seeds: Sequence[int], *, steps: int = 0) -> dict[str, TrainConfig]:
+        """The four methods with each seed: {"mmgsd-0": …, "mmgsd-1": …}; 0 ``steps`` are the main table's."""
+        models = {method: self.method(object, method) for method in METHODS}
+        models = {m: dataclasses.replace(model, steps=steps or model.steps) for m, model in models.items()}
+        return {f"{m}-{s}": dataclasses.replace(models[m], seed=s) for m in models for s in sorted(set(seeds))}
+
 
 def _preset(
     name: str, *, views: dict, train: dict, rope: dict, ablation: dict, evaluate: dict, sigmas: tuple, **images: int

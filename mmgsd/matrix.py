@@ -3,6 +3,7 @@
     python -m mmgsd.matrix paper                                    trains and asks each model; a killed call goes on
     python -m mmgsd.matrix paper --only cloth-spcl                  those whose name holds that text
     python -m mmgsd.matrix paper --scheduler tcp://host:8786        each worker one model at a time, on its own GPU
+    python -m mmgsd.matrix quick --seeds 3                          instead the four methods, each with three seeds
 
 Notebooks find the models and their tables of answers where they would have put them.
 """
@@ -18,7 +19,7 @@ from pathlib import Path
 from dask.distributed import Client, as_completed
 from tqdm.auto import tqdm
 
-from mmgsd.config import OBJECTS, OWN_STEPS, Paths, Preset, TrainConfig, find_root, load_preset
+from mmgsd.config import METHODS, OBJECTS, OWN_STEPS, Paths, Preset, TrainConfig, find_root, load_preset
 from mmgsd.evaluation import (
     BASELINES,
     CHANCE,
@@ -38,20 +39,26 @@ VALIDATIONS = 8  # RMSE on held-out simulations, in a model's log
 Task = TrainConfig | tuple[str, str]  # a model to train and ask, or an object and a baseline to ask
 
 
-def list_models(preset: Preset, *, seeds: int = 1) -> list[TrainConfig]:
-    """MMGSD and SPCL, the studies' models (symmetry, methods, σ), the rest of the main table, and further seeds."""
+def list_models(preset: Preset) -> list[TrainConfig]:
+    """MMGSD and SPCL, the studies' models (symmetry, methods, σ), and the rest of the main table."""
     main, last = {name: preset.main_table(name) for name in OBJECTS}, (*LATER, *OWN_STEPS)
     first, later = ([main[name][method] for method in methods for name in OBJECTS] for methods in (FIRST, last))
     budget = [preset.budget_table(name)[m] for m in (*FIRST, *LATER) for name in OBJECTS]
     groups = [dataclasses.replace(preset.ablation["cloth"], group=group) for group in GROUPS]
     sigmas = [preset.sigma_table(name)[sigma] for sigma in preset.sigma_table("cloth") for name in OBJECTS]
-    repeated = [dataclasses.replace(config, seed=seed) for seed in range(1, seeds) for config in first]
-    return list(dict.fromkeys([*first, *groups, *budget, *sigmas, *later, *repeated]))
+    return list(dict.fromkeys([*first, *groups, *budget, *sigmas, *later]))
 
 
-def list_tasks(preset: Preset, *, seeds: int = 1) -> list[Task]:
+def list_repeats(preset: Preset, seeds: int, *, steps: int = 0) -> list[TrainConfig]:
+    """The four methods of the main table, of other ``steps`` than its where they are not 0: all with seed 0, then 1…"""
+    keyed = {object: preset.seed_table(object, range(seeds), steps=steps) for object in OBJECTS}
+    order = METHODS[::-1]  # MMGSD first
+    return [keyed[object][f"{m}-{seed}"] for seed in range(seeds) for m in order for object in OBJECTS]
+
+
+def list_tasks(preset: Preset) -> list[Task]:
     """MMGSD and SPCL, then chance and the hand-made descriptors, then the other models (`list_models`)."""
-    models, count = list_models(preset, seeds=seeds), len(FIRST) * len(OBJECTS)
+    models, count = list_models(preset), len(FIRST) * len(OBJECTS)
     return [*models[:count], *((name, method) for method in (*CHANCE, *BASELINES) for name in OBJECTS), *models[count:]]
 
 
@@ -143,6 +150,17 @@ def write_sigma_table(preset: Preset, root: Path, sigmas_px: Sequence[float] = (
     _write_study({name: preset.sigma_table(name, chosen, steps=steps) for name in OBJECTS}, paths, study)
 
 
+def write_seed_table(preset: Preset, root: Path, seeds: int = 0, *, steps: int = 0) -> None:
+    """Write seeds.json, by the rule of `write_tables`: of the seeds 0 to ``seeds`` - 1, and those that are there.
+
+    The models of other ``steps`` than the main table's have a file of their own: seeds_1000.json.
+    """
+    paths, study = Paths(root, preset.name), f"seeds_{steps}" if steps else "seeds"
+    there = [int(key.rpartition("-")[2]) for rows in _read(paths.results / f"{study}.json").values() for key in rows]
+    chosen = [*range(seeds), *there]
+    _write_study({name: preset.seed_table(name, chosen, steps=steps) for name in OBJECTS}, paths, study)
+
+
 def _write_study(models: dict[str, dict[str, TrainConfig]], paths: Paths, study: str) -> None:
     """One file {object: {key: errors, and under "run" the cost}} of models under the same keys, where any is done."""
     stored, rows = _read(paths.results / f"{study}.json"), {}
@@ -172,18 +190,25 @@ def main() -> None:
     """Run the models and baselines of a preset, a line each."""
     parser = argparse.ArgumentParser(prog="python -m mmgsd.matrix", description=__doc__.split("\n")[0])
     parser.add_argument("preset")
-    parser.add_argument("--seeds", type=int, default=1, help="of mmgsd and spcl (default %(default)s)")
     parser.add_argument("--only", default="", help="those whose name holds this text, like cloth or cloth-spcl")
+    parser.add_argument("--seeds", type=int, default=0, help="instead the four methods, each with so many seeds")
+    parser.add_argument("--steps", type=int, default=0, help="of those (default: the main table's)")
     parser.add_argument("--scheduler", default="", help="address of a Dask scheduler; none: this process")
     asked = parser.parse_args()
+    if asked.seeds < 0 or asked.steps < 0 or (asked.steps and not asked.seeds):
+        parser.error("--seeds and --steps must be positive, and --steps needs --seeds")
     preset = load_preset(asked.preset)
-    tasks = [task for task in list_tasks(preset, seeds=asked.seeds) if asked.only in name_task(task)]
+    tasks = list_repeats(preset, asked.seeds, steps=asked.steps) if asked.seeds else list_tasks(preset)
+    tasks = [task for task in tasks if asked.only in name_task(task)]
     if not tasks:
         parser.error(f"--only {asked.only!r}: no model or baseline of the preset {preset.name} has a name with that")
     done = run_tasks(tasks, preset, find_root(), scheduler=asked.scheduler)
     for name, rmse in tqdm(done, total=len(tasks), desc="models and baselines"):
         tqdm.write(f"{name}: {rmse:.1f} px")
-        write_tables(preset, find_root())
+        if asked.seeds:
+            write_seed_table(preset, find_root(), asked.seeds, steps=asked.steps)
+        else:
+            write_tables(preset, find_root())
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import statistics
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -46,6 +47,28 @@ def make_sigma_table(results: Errors) -> str:
     """The same measures of MMGSD by the std of its targets."""
     sigmas = sorted({sigma for rows in results.values() for sigma in rows}, key=float)
     return "\n".join(_make_lines("σ px", results, {sigma: sigma for sigma in sigmas}))
+
+
+def make_seed_table(results: Errors) -> str:
+    """Markdown of the mean and the std of the RMSE over seeds, from {object: {"mmgsd-0": errors}}, a method a row."""
+    lines = ["| RMSE px: mean ± std (seeds) | cloth | rope |", "|---|---|---|"]
+    for method, label in LABELS.items():
+        errors = [collect_seeds(results.get(object, {}), method) for object in PAPER]
+        if any(errors):
+            lines.append(f"| {label} | {' | '.join(format_seeds(values) for values in errors)} |")
+    return "\n".join(lines)
+
+
+def collect_seeds(rows: dict[str, dict[str, float]], method: str) -> list[float]:
+    """The method's RMSE (px) with each seed, of {"mmgsd-0": errors, "mmgsd-1": …}."""
+    return [row["rmse_mean"] for key, row in rows.items() if key.rpartition("-")[0] == method]
+
+
+def format_seeds(values: list[float]) -> str:
+    """"54.6 ± 0.8 (3)": mean, std of the sample, and how many; no std of fewer than two."""
+    if len(values) < 2:
+        return f"{values[0]:.1f} (1)" if values else "–"
+    return f"{statistics.mean(values):.1f} ± {statistics.stdev(values):.1f} ({len(values)})"
 
 
 def make_symmetry_table(results: dict[str, dict[str, Any]]) -> str:
@@ -138,6 +161,7 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "symmetry": ("paper/symmetry.json", make_symmetry_table),
     "fixes": ("paper/broken_symmetry.json", make_fixes_table),
     "quick": ("quick/rmse.json", make_results_table),
+    "seeds_quick": ("quick/seeds.json", make_seed_table),
     "uncertainty": ("paper/uncertainty.json", make_uncertainty_table),
     "uncertainty_quick": ("quick/uncertainty.json", make_uncertainty_table),
 }

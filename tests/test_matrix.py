@@ -11,32 +11,78 @@ import pytest
 from dask.distributed import LocalCluster
 
 from mmgsd import matrix
-from mmgsd.config import LONGER_TRAINED, Preset, load_preset
+from mmgsd.config import LONGER_TRAINED, METHODS, OBJECTS, Preset, load_preset
 from mmgsd.evaluation import write_results
-from mmgsd.matrix import list_models, list_tasks, run_tasks, write_sigma_table, write_tables
+from mmgsd.matrix import (
+    list_models,
+    list_repeats,
+    list_tasks,
+    run_tasks,
+    write_seed_table,
+    write_sigma_table,
+    write_tables,
+)
 
 SMOKE = load_preset("smoke")
 
 
 def test_the_models_that_matter_most_come_first() -> None:
-    models = list_models(load_preset("paper"), seeds=3)
+    models = list_models(load_preset("paper"))
     assert [(m.object, m.method) for m in models[:4]] == [
         ("cloth", "mmgsd"), ("rope", "mmgsd"), ("cloth", "spcl"), ("rope", "spcl")
     ]  # fmt: skip
     assert [m.group for m in models[4:7]] == ["c4", "v4", "d4"]  # the studies, then the rest of the main table
-    order, steps = [m.method for m in models], [m.steps for m in models]
+    steps = [m.steps for m in models]
     assert models[4] == load_preset("paper").budget_table("cloth")["mmgsd"]  # one model, two tables
     assert max(i for i, m in enumerate(models) if m.sigma_px == 16) == max(i for i, n in enumerate(steps) if n == 1000)
-    assert set(steps[4:30]) == {1000} and set(steps[30:42] + steps[50:]) == {4000}
+    assert set(steps[4:30]) == {1000} and set(steps[30:42]) == {4000} and len(models) == 50
     assert steps[42:50] == [3500] * 2 + [12000] * 2 + [3000] * 4
     assert [m.trunk_weights for m in models[46:50]] == [m.name for m in models[44:48]]  # these are trained before
-    assert order[-8:] == ["mmgsd", "mmgsd", "spcl", "spcl"] * 2
     assert len({m.name for m in models}) == len(models)
     assert {m.group for m in models if m.object == "cloth"} == {"c4", "v4", "d4"}
     assert sorted({m.sigma_px for m in models}) == [1.0, 2.0, 4.0, 8.0, 16.0]
-    assert {m.seed for m in models if m.method == "mmgsd"} == {0, 1, 2}
+    assert {m.seed for m in models} == {0}
     assert sum(m.method == "spcl" and m.dense_weight == 1.0 for m in models) == 8
     assert sum(m.method == "mmgsd" and m.dense_weight == 0.0 for m in models) == 8
+
+
+def test_seed_after_seed_the_four_methods_are_repeated() -> None:
+    preset = load_preset("paper")
+    models = list_repeats(preset, 3)
+    assert [m.seed for m in models] == [0] * 8 + [1] * 8 + [2] * 8
+    assert models[:8] == [preset.method(name, method) for method in METHODS[::-1] for name in OBJECTS]
+    of_budget = [preset.budget_table(name)[method] for method in METHODS[::-1] for name in OBJECTS]
+    assert list_repeats(preset, 1, steps=1000) == of_budget
+
+
+def test_errors_of_several_seeds_are_written(
+    tiny_dataset: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    preset = make_tiny(tiny_dataset, tmp_path)
+    monkeypatch.setattr(matrix, "load_preset", lambda _: preset)
+    monkeypatch.setattr(matrix, "find_root", lambda: tmp_path)
+    monkeypatch.setattr("sys.argv", ["mmgsd.matrix", "smoke", "--seeds", "2", "--steps", "1", "--only", "cloth-mm"])
+    matrix.main()
+    written = tmp_path / "data" / "results" / "smoke" / "seeds_1.json"
+    table = json.loads(written.read_text())
+    assert table.keys() == {"cloth"} and table["cloth"].keys() == {"mmgsd-0", "mmgsd-1"}
+    assert [table["cloth"][f"mmgsd-{seed}"]["run"]["seed"] for seed in (0, 1)] == [0, 1]
+    assert len({row["rmse_mean"] for row in table["cloth"].values()}) == 2
+    assert not (written.parent / "rmse.json").exists()
+    for file in (tmp_path / "data" / "generated" / "smoke" / "queries").iterdir():  # as on another machine
+        file.unlink()
+    write_seed_table(preset, tmp_path, 1, steps=1)  # seed 1 stays, though only seed 0 is asked for
+    assert json.loads(written.read_text()) == table
+
+
+@pytest.mark.parametrize("words", ["--seeds -1", "--steps 10", "--seeds 2 --steps -1"])
+def test_how_often_to_train_is_checked(
+    words: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.setattr("sys.argv", ["mmgsd.matrix", "smoke", *words.split()])
+    with pytest.raises(SystemExit):
+        matrix.main()
+    assert "--seeds and --steps must be positive" in capsys.readouterr().err
 
 
 def test_baselines_come_before_the_studies() -> None:

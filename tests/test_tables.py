@@ -12,6 +12,7 @@ from mmgsd.tables import (
     make_budget_table,
     make_fixes_table,
     make_results_table,
+    make_seed_table,
     make_sigma_table,
     make_symmetry_table,
     make_uncertainty_table,
@@ -53,6 +54,13 @@ def test_sigmas_are_in_order_of_their_width() -> None:
     assert rows[0].startswith("| σ px | cloth: RMSE px | median px | pck@20px | rope: RMSE px")
     assert [line.split(" | ")[0] for line in rows[2:]] == ["| 2", "| 16"]
     assert rows[3].endswith("| 50 % | – | – | – |")
+
+
+def test_seeds_are_a_mean_and_a_std() -> None:
+    cloth = {f"mmgsd-{seed}": {"rmse_mean": error} for seed, error in enumerate((50.0, 51.0, 52.0))}
+    rows = make_seed_table({"cloth": cloth | {"spcl-0": {"rmse_mean": 60.0}}, "rope": {"pcl-1": {"rmse_mean": 70.0}}})
+    assert rows.splitlines()[2:] == ["| **MMGSD** (ours) | 51.0 ± 1.0 (3) | – |", "| SPCL | 60.0 (1) | – |",
+                                     "| PCL | – | 70.0 (1) |"]  # fmt: skip
 
 
 def test_a_group_has_its_errors_by_place() -> None:
