@@ -65,7 +65,7 @@ def collect_seeds(rows: dict[str, dict[str, float]], method: str) -> list[float]
 
 
 def format_seeds(values: list[float]) -> str:
-    """"54.6 ± 0.8 (3)": mean, std of the sample, and how many; no std of fewer than two."""
+    """Mean, std of the sample, and how many: "54.6 ± 0.8 (3)"; no std of fewer than two."""
     if len(values) < 2:
         return f"{values[0]:.1f} (1)" if values else "–"
     return f"{statistics.mean(values):.1f} ± {statistics.stdev(values):.1f} ({len(values)})"
