@@ -160,6 +160,7 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "sigma_4000": ("paper/sigma_4000.json", make_sigma_table),
     "symmetry": ("paper/symmetry.json", make_symmetry_table),
     "fixes": ("paper/broken_symmetry.json", make_fixes_table),
+    "seeds_1000": ("paper/seeds_1000.json", make_seed_table),
     "quick": ("quick/rmse.json", make_results_table),
     "seeds_quick": ("quick/seeds.json", make_seed_table),
     "uncertainty": ("paper/uncertainty.json", make_uncertainty_table),
