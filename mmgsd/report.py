@@ -22,7 +22,7 @@ from mmgsd import report_tables as tables
 from mmgsd.claims import list_claims
 from mmgsd.config import IMAGE_SIZE, N_POINTS, OBJECTS, Paths, find_root, load_preset
 
-FILES = ("rmse", "runs", "budget", "sigma", "uncertainty", "symmetry", "broken_symmetry", "errors")
+FILES = ("rmse", "runs", "budget", "sigma", "uncertainty", "symmetry", "broken_symmetry", "errors", "seeds_1000")
 ENDS = 0.1  # of a rope's length at each end, its extremities; the middle is the fifth around its centre
 
 Results = Mapping[str, Any]

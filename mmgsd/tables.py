@@ -53,18 +53,18 @@ def make_seed_table(results: Errors) -> str:
     """Markdown of the mean and the std of the RMSE over seeds, from {object: {"mmgsd-0": errors}}, a method a row."""
     lines = ["| RMSE px: mean ± std (seeds) | cloth | rope |", "|---|---|---|"]
     for method, label in LABELS.items():
-        errors = [collect_seeds(results.get(object, {}), method) for object in PAPER]
+        errors = [_collect_seeds(results.get(object, {}), method) for object in PAPER]
         if any(errors):
-            lines.append(f"| {label} | {' | '.join(format_seeds(values) for values in errors)} |")
+            lines.append(f"| {label} | {' | '.join(_format_seeds(values) for values in errors)} |")
     return "\n".join(lines)
 
 
-def collect_seeds(rows: dict[str, dict[str, float]], method: str) -> list[float]:
+def _collect_seeds(rows: dict[str, dict[str, float]], method: str) -> list[float]:
     """The method's RMSE (px) with each seed, of {"mmgsd-0": errors, "mmgsd-1": …}."""
     return [row["rmse_mean"] for key, row in rows.items() if key.rpartition("-")[0] == method]
 
 
-def format_seeds(values: list[float]) -> str:
+def _format_seeds(values: list[float]) -> str:
     """Mean, std of the sample, and how many: "54.6 ± 0.8 (3)"; no std of fewer than two."""
     if len(values) < 2:
         return f"{values[0]:.1f} (1)" if values else "–"
