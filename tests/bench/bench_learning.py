@@ -1,10 +1,10 @@
 """What a number of minutes of training buys: ``python tests/bench/bench_learning.py --minutes 3 12``.
 
 For each budget one MMGSD model of the preset's data is trained from the start, in as many steps as fit (the pace is
-measured first), and validated on the training simulations that `hold_out` keeps apart: never on test images. Settings
-of `TrainConfig` can be changed, before the options: ``input_px=160 batch=24 --minutes 12``. Every run is a row of
-``data/results/experiments.csv``; one that was interrupted goes on. Run it alone: a second busy process slows torch
-down several times.
+measured first) or in ``--steps``, and validated on the training simulations that `hold_out` keeps apart: never on test
+images. Settings of `TrainConfig` can be changed, before the options: ``input_px=160 batch=24 --minutes 12``. Every run
+is a row of ``data/results/experiments.csv``; one that was interrupted goes on. Run it alone: a second busy process
+slows torch down several times.
 """
 
 from __future__ import annotations
@@ -50,6 +50,11 @@ def measure_pace(config: TrainConfig, dataset: Path) -> float:
     return float(seconds[PACE_STEPS:].median())
 
 
+def plan_steps(minutes: list[float], pace: float) -> list[int]:
+    """As many as fit, of two digits: an interrupted run is found again although the pace is never the same."""
+    return [int(float(f"{max(1.0, 60 * budget / pace):.2g}")) for budget in minutes]
+
+
 def record(row: dict[str, object], path: Path) -> None:
     """Append a row to the log of experiments, unless the same run is there already."""
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -71,6 +76,7 @@ def main() -> None:
     parser.add_argument("--object", default="cloth", choices=OBJECTS)
     parser.add_argument("--method", default="mmgsd", choices=METHODS)
     parser.add_argument("--minutes", type=float, nargs="+", default=[3.0, 12.0])
+    parser.add_argument("--steps", type=int, nargs="+", help="budgets in steps instead")
     parser.add_argument("changes", nargs="*", metavar="name=value", help="settings of TrainConfig")
     asked = parser.parse_args()
     paths = Paths(find_root(), asked.preset)
@@ -78,13 +84,11 @@ def main() -> None:
     config, dataset = dataclasses.replace(config, **parse_changes(asked.changes)), paths.dataset(asked.object)
     held_out = hold_out(load_dataset(dataset, "train"))[1]
     commit = subprocess.run(["git", "describe", "--always", "--dirty"], capture_output=True, text=True).stdout.strip()
-    pace, results = measure_pace(config, dataset), []
-    for minutes in asked.minutes:
-        # two digits: an interrupted run is found again although the pace is never the same
-        steps = int(float(f"{max(1.0, 60 * minutes / pace):.2g}"))
+    results = []
+    for steps in asked.steps or plan_steps(asked.minutes, measure_pace(config, dataset)):
         run = dataclasses.replace(config, steps=steps)
         folder, how = paths.generated / "experiments" / run.name, {"progress": sys.stderr.isatty()}
-        weights = train_model(run, dataset, folder, validate_every=steps // 4, **how)
+        weights = train_model(run, dataset, folder, validate_every=max(1, steps // 4), **how)
         note, rmse = load_metadata(weights), measure_rmse(Matcher.load(weights), held_out)
         taken = float(note["seconds"]) / 60
         row = {
