@@ -36,7 +36,6 @@ REFERENCE = {  # Dense Object Nets' training (Florence et al. 2018): 3,500 steps
     "learning_rate": 1e-4, "schedule": "step", "weight_decay": 1e-4, "bend": 0.0, "augment": False,
 }  # fmt: skip
 OWN_STEPS = ("spcl_reference", *LONGER_TRAINED)  # models of the main table with another number of steps than the rest
-ADDED = {"layers": 1, "answer_weight": 0.0}  # fields that came later, and what was done without them
 N_POINTS = 625  # material points of the cloth and the rope
 
 Config = TypeVar("Config", bound="RenderConfig | TrainConfig | EvaluateConfig")
@@ -116,7 +115,6 @@ class TrainConfig:
     trunk_weights: str = ""
     descriptor_dim: int = 32
     roles: int = 1  # 2: a pixel that is asked about and one that answers have descriptors of their own
-    layers: int = 1  # descriptors that a pixel answers with, more than one for the layers of a fold
     input_px: int = 128  # the longer side of the network's input
     steps: int = 600
     batch: int = 16  # images a step
@@ -129,7 +127,6 @@ class TrainConfig:
     sigma_px: float = 1.0  # std of a target mode at the end of training
     sigma_start_px: float = 48.0  # std at its start; annealed geometrically over the first two thirds
     prototype_weight: float = -1.0  # of the dense supervision by single images; -1: 0 for pcl and spcl, 1 for others
-    answer_weight: float = 0.0  # of its converse: every material point is looked for in every image
     margin: float = 0.5  # contrastive losses only
     non_matches: int = 150  # a match, half of them on the object (contrastive losses only)
     augment: bool = True
@@ -149,9 +146,6 @@ class TrainConfig:
         for name in ("descriptor_dim", "steps", "pairs", "queries"):
             _check(name, getattr(self, name), "at least 1", getattr(self, name) >= 1)
         _check("roles", self.roles, "1 or 2", self.roles in (1, 2))
-        several = self.roles == 2 and self.method not in CONTRASTIVE
-        accepted = "from 1 to 8" if several else "1 where roles is 1 or the method pcl or spcl"
-        _check("layers", self.layers, accepted, self.layers == 1 or (several and 1 <= self.layers <= 8))
         _check("non_matches", self.non_matches, "at least 2 (on and off the object)", self.non_matches >= 2)
         for name in ("learning_rate", "sigma_px", "sigma_start_px", "margin"):
             _check(name, getattr(self, name), "greater than 0", getattr(self, name) > 0)
@@ -161,7 +155,7 @@ class TrainConfig:
         _check("groups", self.groups, each, divides and self.batch // self.groups >= 2)
         _check("input_px", self.input_px, "at least 64", self.input_px >= 64)
         _check("bend", self.bend, "in [0, 0.5]", 0 <= self.bend <= 0.5)
-        for name in ("weight_decay", "answer_weight", "seed"):
+        for name in ("weight_decay", "seed"):
             _check(name, getattr(self, name), "at least 0", getattr(self, name) >= 0)
 
     @property
@@ -304,12 +298,8 @@ PRESETS = {
 
 
 def digest(config: Config) -> str:
-    """Eight hexadecimal digits that differ where any field of the configuration differs.
-
-    A field of `ADDED` counts only where it is not as it was before there was one: models keep their names.
-    """
-    values = {name: value for name, value in dataclasses.asdict(config).items() if value != ADDED.get(name)}
-    text = json.dumps(values, sort_keys=True)
+    """Eight hexadecimal digits that differ where any field of the configuration differs."""
+    text = json.dumps(dataclasses.asdict(config), sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:8]
 
 

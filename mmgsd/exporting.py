@@ -23,11 +23,11 @@ TOLERANCE = 1e-3  # of a descriptor, relative to the largest
 def export_onnx(matcher: Matcher, path: Path) -> float:
     """Write the network as ``path``: ``image`` (B, 3, h, w) in [0, 1] of its input size, ``descriptors`` (B, C, …) out.
 
-    C is D; or where the training's ``roles`` is 2, the D of a pixel that is asked about, then D for each of the
-    ``layers`` of one that answers. The file's metadata hold ``input_size`` ("width height", px) and the
-    training's ``config``. What onnxruntime makes of random images is compared with torch, both in single precision:
-    returns the largest difference, relative to the largest value. ValueError for another ending than .onnx,
-    RuntimeError where they differ by more than 1e-3.
+    C is D; or 2 D where the training's ``roles`` is 2: first those of a pixel that is asked about, then those of one
+    that answers. The file's metadata hold ``input_size`` ("width height", px) and the training's ``config``. What
+    onnxruntime makes of random images is compared with torch, both in single precision: returns the largest
+    difference, relative to the largest value. ValueError for another ending than .onnx, RuntimeError where they differ
+    by more than 1e-3.
     """
     if path.suffix != ".onnx":
         raise ValueError(f"path must end with .onnx, got {path}")

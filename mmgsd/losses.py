@@ -20,16 +20,6 @@ def compute_squared_distances(source: Tensor, target: Tensor) -> Tensor:
     return torch.baddbmm(norms, source, target.mT, alpha=-2).clamp(min=0)
 
 
-def combine_layers(squared_distances: Tensor, layers: int) -> Tensor:
-    """Squared distances (..., layers * C), layer by layer, as one a cell (..., C): -ln of the sum of exp(-distance²).
-
-    A cell whose pixels lie on a fold answers for each of its layers: p of a cell is then the sum over its descriptors.
-    """
-    if layers == 1:
-        return squared_distances
-    return -torch.logsumexp(-squared_distances.unflatten(-1, (layers, -1)), -2)
-
-
 def compute_target(modes: Tensor, valid: Tensor, xs: Tensor, ys: Tensor, sigma_px: float) -> Tensor:
     """The n-modal isotropic Gaussian mixture on a grid of cells (paper section "Symmetric Distributional Loss").
 

@@ -16,10 +16,9 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from mmgsd.config import CONTRASTIVE, TrainConfig, find_root, from_dict
-from mmgsd.losses import combine_layers, compute_squared_distances
+from mmgsd.losses import compute_squared_distances
 from mmgsd.mixture import Mixture, fit_modes
 from mmgsd.network import (
-    arrange_targets,
     build_network,
     compute_cell_centres,
     compute_input_size,
@@ -148,8 +147,7 @@ class Matcher:
         if metadata.get("format") != "mmgsd-1":
             raise ValueError(f"{path} holds no mmgsd weights: its metadata says format {metadata.get('format')!r}")
         config = from_dict(TrainConfig, json.loads(metadata["config"]))
-        shape = {"roles": config.roles, "layers": config.layers}
-        network = build_network(config.network, config.descriptor_dim, pretrained=False, **shape)
+        network = build_network(config.network, config.descriptor_dim, roles=config.roles, pretrained=False)
         try:
             network.load_state_dict({name: value.float() for name, value in state.items()})
         except RuntimeError as error:
@@ -162,7 +160,7 @@ class Matcher:
     def describe(self, images: list[np.ndarray]) -> Tensor:
         """Descriptors (B, C, h, w) of B images (H, W, 3) uint8 of any sizes, the mean over quarter turns.
 
-        C is D; or, where an image is described in both roles, D as a source first, then D for each layer as a target.
+        C is D, or 2 D where an image is described in both roles: as a source first, then as a target.
         """
         size = compute_input_size(self.size, self.config.input_px)
         small = np.stack([cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in images])
@@ -179,8 +177,7 @@ class Matcher:
         """Heatmaps (S, h, w) of source px ``xy`` (S, 2) of an image of ``size``, from what `describe` made of each."""
         dim = self.config.descriptor_dim
         source = sample_descriptors(descriptors0[None, :dim], xy[None].to(self.device), size)  # (1, S, D)
-        squared = compute_squared_distances(source, arrange_targets(descriptors1[None], dim))[0]  # (S, layers * h * w)
-        squared = combine_layers(squared, self.config.layers)  # (S, h * w)
+        squared = compute_squared_distances(source, descriptors1[-dim:].flatten(1).T[None])[0]  # (S, h * w)
         heatmap = compute_heatmap(squared, bandwidth=self.bandwidth, temperature=self.temperature)
         return heatmap.view(len(xy), *descriptors1.shape[1:])
 

@@ -21,7 +21,7 @@ TAPS = {2: 24, 4: 40, 10: 112, 15: 320}  # EfficientNet-Lite0: block after which
 
 
 class PyramidNetwork(nn.Module):
-    """EfficientNet-Lite0 trunk with a feature pyramid; (B, 3, H, W) in [0, 1] to (B, C, H / 4, W / 4).
+    """EfficientNet-Lite0 trunk with a feature pyramid; (B, 3, H, W) in [0, 1] to (B, roles * D, H / 4, W / 4).
 
     ``passes`` over the pyramid: the first upwards, each further one (`PyramidPass`) down and up again.
     """
@@ -30,9 +30,8 @@ class PyramidNetwork(nn.Module):
     reduced_precision = True  # bfloat16 where that is faster
 
     def __init__(
-        self, descriptor_dim: int, *,
-        roles: int = 1, layers: int = 1, passes: int = 1, width: int = 96, pretrained: bool = True,
-    ) -> None:  # fmt: skip
+        self, descriptor_dim: int, *, roles: int = 1, passes: int = 1, width: int = 96, pretrained: bool = True
+    ) -> None:
         super().__init__()
         self.trunk = EfficientNet.from_name("efficientnet-lite0")
         if pretrained:
@@ -45,7 +44,7 @@ class PyramidNetwork(nn.Module):
         self.merge = nn.ModuleList(_conv_block(width, width) for _ in TAPS)
         self.context = nn.Sequential(_conv_block(width, width), _conv_block(width, width))
         self.again = nn.ModuleList(PyramidPass(width) for _ in range(passes - 1))
-        self.head = _make_head(width, descriptor_dim, roles, layers)
+        self.head = _make_head(width, descriptor_dim, roles)
         _register_normalisation(self)
 
     def train(self, mode: bool = True) -> PyramidNetwork:
@@ -119,16 +118,15 @@ class PyramidPass(nn.Module):
 
 
 class TwoRoles(nn.Module):
-    """Features to (B, (1 + layers) * D, h, w): the descriptor of a pixel that is asked about, then those that answer.
+    """Features to (B, 2 D, h, w): the descriptor of a pixel that is asked about, then that of one that answers.
 
-    On a fold they differ: the upper layer asks for itself alone, and answers for the hidden ones too. One descriptor
-    that answers for several places lies between theirs; with several layers each place may have its own.
+    On a fold they differ: the upper layer asks for itself alone, and answers for the hidden ones too.
     """
 
-    def __init__(self, width: int, descriptor_dim: int, layers: int) -> None:
+    def __init__(self, width: int, descriptor_dim: int) -> None:
         super().__init__()
         self.source = nn.Conv2d(width, descriptor_dim, 1)
-        self.target = nn.Sequential(_conv_block(width, width), nn.Conv2d(width, layers * descriptor_dim, 1))
+        self.target = nn.Sequential(_conv_block(width, width), nn.Conv2d(width, descriptor_dim, 1))
 
     def forward(self, x: Tensor) -> Tensor:
         """Source's channels first."""
@@ -145,14 +143,14 @@ class ResNet34Network(nn.Module):
     stride = 4
     reduced_precision = True
 
-    def __init__(self, descriptor_dim: int, *, roles: int = 1, layers: int = 1) -> None:
+    def __init__(self, descriptor_dim: int, *, roles: int = 1) -> None:
         super().__init__()
         self.trunk = ResNet34Trunk()
-        self.head = _make_head(512, descriptor_dim, roles, layers)
+        self.head = _make_head(512, descriptor_dim, roles)
         _register_normalisation(self)
 
     def forward(self, image: Tensor) -> Tensor:
-        """(B, 3, H, W) in [0, 1] to (B, C, H / 4, W / 4)."""
+        """(B, 3, H, W) in [0, 1] to (B, roles * D, H / 4, W / 4)."""
         with torch.autocast(image.device.type, torch.bfloat16, enabled=self.reduced_precision):
             x = self.trunk((image - self.mean) / self.std)  # (B, 512, H / 8, W / 8)
         size = [side // self.stride for side in image.shape[-2:]]
@@ -215,20 +213,16 @@ class BasicBlock(nn.Module):
 
 
 def build_network(
-    name: str, descriptor_dim: int, *,
-    roles: int = 1, layers: int = 1, pretrained: bool = True, trunk_weights: Path | str = "",
-) -> PyramidNetwork | ResNet34Network:  # fmt: skip
-    """The network of a name in `NETWORKS`; ValueError for another name.
-
-    Its C channels are D for 1 role; for 2 the D of a pixel that is asked about, then D for each of the ``layers`` that
-    one answers with.
+    name: str, descriptor_dim: int, *, roles: int = 1, pretrained: bool = True, trunk_weights: Path | str = ""
+) -> PyramidNetwork | ResNet34Network:
+    """The network of a name in `NETWORKS` with D channels for each of 1 or 2 roles; ValueError for another name.
 
     ``pretrained`` starts lite0 from ImageNet; resnet34 does from the file ``trunk_weights`` where one is given.
     """
     if name in PASSES:
-        return PyramidNetwork(descriptor_dim, roles=roles, layers=layers, passes=PASSES[name], pretrained=pretrained)
+        return PyramidNetwork(descriptor_dim, roles=roles, passes=PASSES[name], pretrained=pretrained)
     if name == "resnet34":
-        network = ResNet34Network(descriptor_dim, roles=roles, layers=layers)
+        network = ResNet34Network(descriptor_dim, roles=roles)
         if pretrained and trunk_weights:
             network.load_trunk(trunk_weights)
         return network
@@ -254,12 +248,6 @@ def sample_descriptors(descriptors: Tensor, xy: Tensor, size: tuple[int, int]) -
     return sampled[:, :, 0].mT  # (B, P, D)
 
 
-def arrange_targets(descriptors: Tensor, dim: int) -> Tensor:
-    """Descriptors (B, layers * h * w, D) that answer, layer by layer, of a network's (B, C, h, w)."""
-    answering = descriptors[:, dim:] if descriptors.shape[1] > dim else descriptors
-    return answering.unflatten(1, (-1, dim)).permute(0, 1, 3, 4, 2).flatten(1, 3)
-
-
 def find_device() -> str:
     """``cuda`` where torch finds one, else ``cpu``."""
     return "cuda" if torch.cuda.is_available() else "cpu"
@@ -279,8 +267,8 @@ def _resize(x: Tensor, like: Tensor) -> Tensor:
     return F.interpolate(x, like.shape[-2:], mode="bilinear", align_corners=False)
 
 
-def _make_head(width: int, descriptor_dim: int, roles: int, layers: int) -> nn.Module:
-    return nn.Conv2d(width, descriptor_dim, 1) if roles == 1 else TwoRoles(width, descriptor_dim, layers)
+def _make_head(width: int, descriptor_dim: int, roles: int) -> nn.Module:
+    return nn.Conv2d(width, descriptor_dim, 1) if roles == 1 else TwoRoles(width, descriptor_dim)
 
 
 def _register_normalisation(module: nn.Module) -> None:

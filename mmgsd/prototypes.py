@@ -2,8 +2,7 @@
 
 The pairwise losses start slowly, for both descriptors of a pair are unknown. Here the second image is the object: each
 visible point is classified among all material points by the distance to their prototypes, which symmetric points share
-(continuous surface embeddings, Neverova et al. 2020). Conversely every prototype may be looked for in an image, as a
-pixel of a first image would be, and hidden points are then supervised too. Matching never uses the prototypes.
+(continuous surface embeddings, Neverova et al. 2020). Matching never uses the prototypes.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mmgsd.losses import combine_layers, compute_squared_distances, mmgsd
+from mmgsd.losses import compute_squared_distances
 
 IMAGES = 100  # images that the initial prototypes are computed from
 SPREAD = 24.0  # mean squared distance of two initial prototypes: exp(-24) is no match
@@ -55,20 +54,3 @@ def compute_prototype_loss(descriptors: Tensor, asked: Tensor, prototypes: Tenso
     distinct = torch.stack([(own[:, : i + 1] == own[:, i, None]).sum(1) == 1 for i in range(own.shape[1])], 1)
     log_own = log_share.gather(1, own).masked_fill(~distinct, -torch.inf).logsumexp(1)  # a fixed point counts once
     return -log_own.sum() / max(1, len(point))
-
-
-def find_orbits(permutations: Tensor) -> Tensor:
-    """The first material point of each orbit, (O,), of a group's (G, P) permutations."""
-    return (permutations.amin(0) == torch.arange(permutations.shape[1], device=permutations.device)).nonzero()[:, 0]
-
-
-def compute_answer_loss(
-    prototypes: Tensor, orbits: Tensor, descriptors: Tensor, wanted: Tensor, layers: int = 1
-) -> Tensor:
-    """Cross-entropy of what images answer to ``orbits`` (Q, G) of material points, with targets ``wanted`` (B, Q, C).
-
-    ``prototypes`` (P, D), of which symmetric points share the mean; ``descriptors`` (B, layers * C, D), layer by layer.
-    """
-    asking = prototypes[orbits].mean(1)  # (Q, D)
-    squared = compute_squared_distances(asking.expand(len(descriptors), -1, -1), descriptors)
-    return mmgsd(combine_layers(squared, layers), wanted)

@@ -30,17 +30,15 @@ from mmgsd.dataset import Dataset, hold_out, load_dataset
 from mmgsd.evaluation import calibrate_bandwidth, calibrate_temperature, measure_rmse
 from mmgsd.matching import Matcher, load
 from mmgsd.network import (
-    arrange_targets,
     build_network,
     compute_cell_centres,
     find_device,
     sample_descriptors,
 )
-from mmgsd.prototypes import compute_answer_loss, compute_prototype_loss, find_orbits, make_prototypes
+from mmgsd.prototypes import compute_prototype_loss, make_prototypes
 
 WEIGHTS, CHECKPOINT, LOG = "weights.safetensors", "checkpoint.safetensors", "log.csv"
 PROTOTYPE_EVERY = 4  # each step asks every so many material points
-ORBITS_ASKED = 160  # of which each step asks every image
 CHECKPOINT_SECONDS = 60.0  # of training between two checkpoints
 
 
@@ -129,8 +127,7 @@ def compute_loss(
         return function((match + 1e-12).sqrt(), valid, (far + 1e-12).sqrt(), apart, margin=config.margin)
     xs, ys = (c.to(descriptors.device) for c in compute_cell_centres(size, descriptors.shape[-2:]))
     wanted = losses.compute_target(modes, valid, xs, ys, compute_sigma(config, step))
-    answering = arrange_targets(descriptors, config.descriptor_dim)[pair[1]]  # (K, layers * C, D)
-    squared = losses.combine_layers(losses.compute_squared_distances(source, answering), config.layers)  # (K, Q, C)
+    squared = losses.compute_squared_distances(source, target[pair[1]].flatten(2).mT)
     return losses.mmgsd(squared, wanted)
 
 
@@ -155,7 +152,6 @@ class _Run:
         self.average = AveragedModel(self.network, multi_avg_fn=average, use_buffers=True)
         start = make_prototypes(self.data.xy, known, config.descriptor_dim, math.hypot(*data.size))
         self.prototypes = torch.nn.Parameter(start.to(device))
-        self.orbits = find_orbits(self.permutations)
         self.trained = [p for p in self.network.parameters() if p.requires_grad]
         self.optimiser = torch.optim.AdamW(
             [*self.trained, self.prototypes], lr=config.learning_rate, weight_decay=config.weight_decay, fused=True
@@ -191,8 +187,6 @@ class _Run:
         loss = compute_loss(self.config, descriptors, batch, self.permutations, self.size, step, group)
         if self.config.dense_weight:
             loss = loss + self.config.dense_weight * self.compute_dense_loss(descriptors, batch)
-        if self.config.answer_weight:
-            loss = loss + self.config.answer_weight * self.compute_answer_loss(descriptors, batch)
         (loss / groups).backward()
         return loss.item() / groups
 
@@ -209,16 +203,6 @@ class _Run:
         asked = batch.askable & (turn == self.step % PROTOTYPE_EVERY)
         sampled = sample_descriptors(descriptors[:, : self.config.descriptor_dim], batch.xy, self.size)
         return compute_prototype_loss(sampled, asked, self.prototypes, self.permutations)
-
-    def compute_answer_loss(self, descriptors: Tensor, batch: Batch) -> Tensor:
-        """The loss of what images answer to prototypes, of a part of the orbits in turn."""
-        turns = math.ceil(len(self.orbits) / ORBITS_ASKED)
-        orbit = self.permutations[:, self.orbits[self.step % turns :: turns]].T  # (Q, G)
-        modes, valid = batch.xy[:, orbit], batch.inside[:, orbit]  # (B, Q, G, 2), (B, Q, G)
-        xs, ys = (c.to(self.device) for c in compute_cell_centres(self.size, descriptors.shape[-2:]))
-        wanted = losses.compute_target(modes, valid, xs, ys, compute_sigma(self.config, self.step))
-        answering = arrange_targets(descriptors, self.config.descriptor_dim)
-        return compute_answer_loss(self.prototypes, orbit, answering, wanted, self.config.layers)
 
     def make_matcher(self) -> Matcher:
         """A matcher of the averaged weights; of a contrastive loss, its bandwidth calibrated."""
@@ -335,11 +319,10 @@ def _make_network(config: TrainConfig, models: Path) -> torch.nn.Module:
     """The network as training starts from it; ``models`` is the folder of the models trained beside it."""
     start, beside = config.trunk_weights, models / config.trunk_weights / WEIGHTS
     start = str(beside) if start and beside.is_file() else start
-    shape = {"roles": config.roles, "layers": config.layers}
-    network = build_network(config.network, config.descriptor_dim, trunk_weights=start, **shape)
+    network = build_network(config.network, config.descriptor_dim, roles=config.roles, trunk_weights=start)
     if start and config.network in PASSES:  # of a model of ours; resnet34 has read torchvision's
         trained = load(start, device="cpu")
-        for name in ("network", "descriptor_dim", "roles", "layers"):
+        for name in ("network", "descriptor_dim", "roles"):
             theirs, asked = getattr(trained.config, name), getattr(config, name)
             fewer_passes = name == "network" and PASSES.get(theirs, math.inf) <= PASSES[asked]
             if theirs != asked and not fewer_passes:

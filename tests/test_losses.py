@@ -12,7 +12,7 @@ from scipy.stats import norm
 from torch import Tensor
 
 from mmgsd import losses
-from mmgsd.losses import combine_layers, compute_squared_distances, compute_target
+from mmgsd.losses import compute_squared_distances, compute_target
 from mmgsd.network import compute_cell_centres
 
 
@@ -61,19 +61,6 @@ def test_descriptors_of_another_shape(name: str) -> None:
     arguments = (bad, good) if name == "source" else (good, bad)
     with pytest.raises(ValueError, match=rf"{name} must have shape \(K, n, D\), got \(2, 3\)"):
         compute_squared_distances(*arguments)
-
-
-def test_layers_by_hand() -> None:
-    # two cells of two layers: exp(-d²) of a cell is the sum over its layers
-    squared = torch.tensor([[0.0, 1.0, math.log(4), 2.0]])
-    expected = torch.tensor([[-math.log(1 + 1 / 4), -math.log(math.exp(-1) + math.exp(-2))]])
-    torch.testing.assert_close(combine_layers(squared, 2), expected)
-    assert combine_layers(squared, 1) is squared
-
-
-def test_far_layers_do_not_count() -> None:
-    squared = torch.tensor([[3.0, 500.0, 1e4, 1e4]])
-    torch.testing.assert_close(combine_layers(squared, 2), torch.tensor([[3.0, 500.0]]))
 
 
 def test_pcl_by_hand() -> None:

@@ -75,18 +75,6 @@ def test_the_first_image_asks_and_the_second_answers() -> None:
     assert divmod(int(heatmap.argmax()), 8) == (5, 6) and heatmap.max() > 0.99
 
 
-def test_a_cell_answers_for_each_of_its_layers() -> None:
-    config = dataclasses.replace(CONFIG, roles=2, layers=2, descriptor_dim=2)
-    network = build_network("lite0", 2, roles=2, layers=2, pretrained=False)
-    matcher = Matcher(network, config, modes=1, size=(64, 64), device="cpu")
-    asking, answering = torch.zeros(6, 8, 8), torch.full((6, 8, 8), -3.0)
-    asking[:2, :, :4], asking[:2, :, 4:] = torch.tensor([[[[3.0]], [[0.0]]], [[[0.0]], [[3.0]]]])
-    answering[2:, 5, 6] = torch.tensor([3.0, 0, 0, 3])  # the left half's descriptor above, the right half's under it
-    heatmap = matcher.compute_heatmaps(asking, answering, torch.tensor([[10.0, 30.0], [50.0, 30.0]]), (64, 64))
-    assert heatmap.shape == (2, 8, 8)
-    assert (heatmap[:, 5, 6] > 0.99).all()
-
-
 def save_weights(path: Path, network: torch.nn.Module, **metadata: str) -> Path:
     stored = {"format": "mmgsd-1", "config": json.dumps(dataclasses.asdict(CONFIG)), "modes": "4", "size": "[485, 485]"}
     save_file({k: v.contiguous() for k, v in network.state_dict().items()}, path, stored | metadata)

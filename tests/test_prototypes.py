@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from mmgsd.prototypes import SPREAD, compute_answer_loss, compute_prototype_loss, find_orbits, make_prototypes
+from mmgsd.prototypes import SPREAD, compute_prototype_loss, make_prototypes
 from mmgsd.symmetry import line_group
 
 GROUP = line_group("c2", n=9)
@@ -48,28 +48,3 @@ def test_nothing_asked_costs_nothing() -> None:
 def test_prototypes_of_another_shape_are_an_error() -> None:
     with pytest.raises(ValueError, match="prototypes must be"):
         compute_prototype_loss(torch.zeros(1, 3, 2), torch.ones(1, 3).bool(), torch.zeros(3, 1), torch.arange(3)[None])
-
-
-def test_an_orbit_is_asked_about_once() -> None:
-    assert find_orbits(torch.tensor(GROUP.permutations)).tolist() == [0, 1, 2, 3, 4]
-    assert find_orbits(torch.arange(9)[None]).tolist() == list(range(9))
-
-
-def test_answer_loss_by_hand() -> None:
-    prototypes, orbits = torch.tensor([[0.0], [3.0], [2.0]]), torch.tensor([[0, 2]])  # both ask as their mean, 1
-    descriptors = torch.tensor([[[1.0], [2.0]]])  # at squared distances 0 and 1
-    shares = torch.tensor([1.0, math.exp(-1)]) / (1 + math.exp(-1))
-    wanted = torch.tensor([[[0.25, 0.75]]])
-    expected = -float((wanted * shares.log()).sum())
-    assert float(compute_answer_loss(prototypes, orbits, descriptors, wanted)) == pytest.approx(expected, rel=1e-5)
-
-
-def test_each_layer_can_give_the_answer() -> None:
-    prototypes, orbits = torch.tensor([[0.0], [9.0]]), torch.tensor([[0], [1]])
-    wanted = torch.tensor([[[1.0, 0.0], [1.0, 0.0]]])  # both lie in the first cell, one above the other
-    folded = torch.tensor([[[0.0], [-9.0], [9.0], [-9.0]]])  # two cells of the upper layer, two of the lower
-    assert float(compute_answer_loss(prototypes, orbits, folded, wanted, 2)) < 1e-6
-    between = torch.tensor([[[4.5], [-9.0]]])
-    assert float(compute_answer_loss(prototypes, orbits, between, wanted)) < 1e-6  # where nothing else is near
-    crowded = torch.tensor([[[4.5], [3.0]]])  # a neighbour that is shown is nearer than the mean of two that lie here
-    assert float(compute_answer_loss(prototypes, orbits, crowded, wanted)) > 1

@@ -19,7 +19,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file
 
 from mmgsd import training
-from mmgsd.config import CONTRASTIVE, METHODS, TrainConfig
+from mmgsd.config import METHODS, TrainConfig
 from mmgsd.dataset import load_dataset
 from mmgsd.matching import Matcher
 from mmgsd.training import (
@@ -170,7 +170,6 @@ def test_a_deeper_network_starts_from_a_shallower_one(cloth_dataset: Path, tmp_p
     [
         ({"descriptor_dim": 4}, ValueError, "trunk_weights .* has descriptor_dim 8, the training 4"),
         ({"roles": 2}, ValueError, "trunk_weights .* has roles 1, the training 2"),
-        ({"roles": 2, "layers": 2}, ValueError, "trunk_weights .* has roles 1, the training 2"),
         ({"trunk_weights": "clth"}, FileNotFoundError, "clth must be a safetensors file or one of 'cloth', "),
     ],
 )
@@ -220,16 +219,16 @@ def test_the_rope_trains(tiny_dataset: Callable[..., Path], tmp_path: Path) -> N
         assert (file.metadata()["modes"], file.metadata()["size"]) == ("2", "[640, 480]")
 
 
-@pytest.mark.parametrize(("roles", "layers", "channels"), [(1, 1, 8), (2, 1, 16), (2, 3, 32)])
-def test_learns_a_single_batch(roles: int, layers: int, channels: int) -> None:
+@pytest.mark.parametrize("roles", [1, 2])
+def test_learns_a_single_batch(roles: int) -> None:
     """Descriptors that are free parameters come two nats closer than a uniform guess, ln 256."""
-    config = dataclasses.replace(TINY, roles=roles, layers=layers, sigma_px=16.0, sigma_start_px=16.0, augment=False)
+    config = dataclasses.replace(TINY, roles=roles, sigma_px=16.0, sigma_start_px=16.0, augment=False)
     xy = torch.tensor([[[60.0, 60], [420, 60], [420, 420], [60, 420]]] * 2)
     seen = torch.ones(2, 4, dtype=torch.bool)
     batch = training.Batch(torch.zeros(2, 3, 64, 64), torch.ones(2, 64, 64, dtype=torch.bool), xy, seen, seen)
     permutations = torch.tensor([[0, 1, 2, 3], [1, 2, 3, 0], [2, 3, 0, 1], [3, 0, 1, 2]])
     descriptors = torch.nn.Parameter(
-        0.1 * torch.randn(2, channels, 16, 16, generator=torch.Generator().manual_seed(0))
+        0.1 * torch.randn(2, 8 * roles, 16, 16, generator=torch.Generator().manual_seed(0))
     )
     optimiser, values = torch.optim.Adam([descriptors], lr=0.1), []
     for _ in range(100):
@@ -253,10 +252,6 @@ def test_roles_with_equal_descriptors_are_one_role(cloth_dataset: Path, method: 
     torch.testing.assert_close(losses[0], losses[1])
     losses[1].backward()
     assert two.grad[:, :8].any() and two.grad[:, 8:].any()
-    if method not in CONTRASTIVE:  # a layer more that says the same changes no heatmap
-        three = torch.cat([one, one, one], 1)
-        config = dataclasses.replace(config, roles=2, layers=2)
-        torch.testing.assert_close(compute_loss(config, three, batch, permutations, data.size, 0), losses[0])
 
 
 @pytest.mark.parametrize("method", ["pcl", "spcl"])
@@ -317,16 +312,6 @@ def test_cosine_schedule_warms_up_and_ends_at_a_hundredth() -> None:
     config = TrainConfig(steps=1000, learning_rate=1.0)
     rates = [compute_learning_rate(config, s) for s in range(1001)]
     assert (rates[0], max(rates), rates[50], rates[1000]) == pytest.approx((0.02, 1.0, 1.0, 0.01), rel=0.01)
-
-
-@pytest.mark.parametrize("change", [{}, {"group": "identity"}, {"roles": 2, "layers": 3}])
-def test_images_can_be_made_to_answer_for_every_point(cloth_dataset: Path, tmp_path: Path, change: dict) -> None:
-    plain = dataclasses.replace(ONE_STEP, **change)
-    paths = [train(dataclasses.replace(plain, answer_weight=weight), cloth_dataset, tmp_path / str(weight))
-             for weight in (0.0, 1.0)]  # fmt: skip
-    losses = [pd.read_csv(path.with_name(LOG)).loss[0] for path in paths]
-    assert losses[1] > losses[0] + 1  # ln 256 = 5.5 where nothing is known
-    assert Matcher.load(paths[1]).config.layers == plain.layers
 
 
 def test_dense_supervision_can_be_given_to_a_contrastive_loss(cloth_dataset: Path, tmp_path: Path) -> None:
