@@ -25,7 +25,8 @@ IMAGE_SIZE = {"cloth": (485, 485), "rope": (640, 480)}  # (width, height) px, pa
 DEFAULT_GROUP = {"cloth": "c4", "rope": "c2"}
 OWN_GROUP = "own"  # of any other object: what its file says
 CONTRASTIVE_REVISION = "r2"  # of PCL's and SPCL's training, to be raised with it: no older model passes for a new one
-PASSES = {"lite0": 1, "lite0x2": 2}  # over the feature pyramid
+PASSES = {"lite0": 1, "lite0x2": 2, "lite0x2fine": 2}  # over the feature pyramid
+DETAILED = ("lite0x2fine",)  # whose trunk sees the image at half its size, a light branch at the whole
 NETWORKS = (*PASSES, "resnet34")  # the last is the contrastive papers' reference
 CONTRASTIVE_MARGIN = 4.0  # of the presets: with the reference's 0.5, lite0's descriptors collapse before they learn
 LONGER = 3  # times the steps of the main table: a model of its own, to see what more training gains
@@ -36,6 +37,8 @@ REFERENCE = {  # Dense Object Nets' training (Florence et al. 2018): 3,500 steps
     "learning_rate": 1e-4, "schedule": "step", "weight_decay": 1e-4, "bend": 0.0, "augment": False,
 }  # fmt: skip
 OWN_STEPS = ("spcl_reference", *LONGER_TRAINED)  # models of the main table with another number of steps than the rest
+OPTIMISERS = ("adamw", "muon")
+ADDED = {"optimiser": "adamw"}  # fields that came later, and how it was done without them
 N_POINTS = 625  # material points of the cloth and the rope
 
 Config = TypeVar("Config", bound="RenderConfig | TrainConfig | EvaluateConfig")
@@ -110,8 +113,8 @@ class TrainConfig:
     method: str = "mmgsd"
     group: str = ""  # symmetry group the matches come from; "" is the object's own (c4, c2, or its file's)
     network: str = "lite0"  # or another of `NETWORKS`
-    # what to start from: for lite0 and lite0x2 a file, or the name of a model trained beside it or in data/weights, of
-    # as many passes or fewer ("": ImageNet); for resnet34 torchvision's ImageNet weights as safetensors ("": random)
+    # what to start from: for those of `PASSES` a file, or the name of a model trained beside it or in data/weights, of
+    # as many parts or fewer ("": ImageNet); for resnet34 torchvision's ImageNet weights as safetensors ("": random)
     trunk_weights: str = ""
     descriptor_dim: int = 32
     roles: int = 1  # 2: a pixel that is asked about and one that answers have descriptors of their own
@@ -121,6 +124,7 @@ class TrainConfig:
     groups: int = 1  # parts of a batch normalised and paired each by itself; as many processes can share a step
     pairs: int = 60  # ordered pairs of images a step
     queries: int = 64  # source points a pair
+    optimiser: str = "adamw"  # or "muon": the convolutions' steps are made orthogonal
     learning_rate: float = 1.5e-3
     schedule: str = "cosine"  # or "step": times 0.9 every 250 steps, the reference of the contrastive losses
     weight_decay: float = 0.02
@@ -139,6 +143,7 @@ class TrainConfig:
         _check_object(self.object)
         _check_choice("method", self.method, METHODS)
         _check_choice("network", self.network, NETWORKS)
+        _check_choice("optimiser", self.optimiser, OPTIMISERS)
         _check_choice("schedule", self.schedule, ("cosine", "step"))
         _set_frozen(self, "group", self.group or DEFAULT_GROUP.get(self.object, OWN_GROUP))
         weight = self.prototype_weight
@@ -298,8 +303,12 @@ PRESETS = {
 
 
 def digest(config: Config) -> str:
-    """Eight hexadecimal digits that differ where any field of the configuration differs."""
-    text = json.dumps(dataclasses.asdict(config), sort_keys=True)
+    """Eight hexadecimal digits that differ where any field of the configuration differs.
+
+    A field of `ADDED` counts only where it is not as before there was one: models keep their names.
+    """
+    values = {name: value for name, value in dataclasses.asdict(config).items() if value != ADDED.get(name)}
+    text = json.dumps(values, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:8]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 
 import torch
@@ -12,7 +13,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from mmgsd.config import NETWORKS, PASSES
+from mmgsd.config import DETAILED, NETWORKS, PASSES
 
 QUIET = 0.1  # scale of what a pass adds that is put onto trained ones: their answers hardly change at first
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
@@ -23,15 +24,17 @@ TAPS = {2: 24, 4: 40, 10: 112, 15: 320}  # EfficientNet-Lite0: block after which
 class PyramidNetwork(nn.Module):
     """EfficientNet-Lite0 trunk with a feature pyramid; (B, 3, H, W) in [0, 1] to (B, roles * D, H / 4, W / 4).
 
-    ``passes`` over the pyramid: the first upwards, each further one (`PyramidPass`) down and up again.
+    ``passes`` over the pyramid: the first upwards, each further one (`PyramidPass`) down and up again. With ``detail``
+    the trunk sees the image at half its size, and three convolutions add what they find at the whole, the edges of a
+    fold, to the pyramid's finest level; the descriptors are then (B, roles * D, H / 8, W / 8).
     """
 
-    stride = 4
     reduced_precision = True  # bfloat16 where that is faster
 
     def __init__(
-        self, descriptor_dim: int, *, roles: int = 1, passes: int = 1, width: int = 96, pretrained: bool = True
-    ) -> None:
+        self, descriptor_dim: int, *, roles: int = 1, passes: int = 1, detail: bool = False, width: int = 96,
+        pretrained: bool = True,
+    ) -> None:  # fmt: skip
         super().__init__()
         self.trunk = EfficientNet.from_name("efficientnet-lite0")
         if pretrained:
@@ -44,6 +47,9 @@ class PyramidNetwork(nn.Module):
         self.merge = nn.ModuleList(_conv_block(width, width) for _ in TAPS)
         self.context = nn.Sequential(_conv_block(width, width), _conv_block(width, width))
         self.again = nn.ModuleList(PyramidPass(width) for _ in range(passes - 1))
+        sizes = (3, width // 4, width // 2, width)
+        self.stride = 8 if detail else 4  # of the descriptors' grid, in px of the input
+        self.detail = nn.Sequential(*(_conv_block(a, b, stride=2) for a, b in pairwise(sizes))) if detail else None
         self.head = _make_head(width, descriptor_dim, roles)
         _register_normalisation(self)
 
@@ -56,11 +62,18 @@ class PyramidNetwork(nn.Module):
         return self
 
     def start_from(self, other: PyramidNetwork) -> None:
-        """Take the weights of a network with as many passes or fewer; ValueError for one with more."""
+        """Take the weights of a network with as many passes, or fewer, and no detail where this one has none.
+
+        ValueError for another.
+        """
         if len(other.again) > len(self.again):
             raise ValueError(f"other must have at most {len(self.again) + 1} passes, got {len(other.again) + 1}")
+        if self.detail is None and other.detail is not None:
+            raise ValueError("other must have no detail, as this network has none")
         for added in self.again[len(other.again) :]:
             torch.nn.init.constant_(added.merge[-1][1].weight, QUIET)
+        if self.detail is not None and other.detail is None:
+            torch.nn.init.constant_(self.detail[-1][1].weight, QUIET)
         self.load_state_dict({**self.state_dict(), **other.state_dict()})
 
     def forward(self, image: Tensor) -> Tensor:
@@ -68,8 +81,11 @@ class PyramidNetwork(nn.Module):
         x = (image - self.mean) / self.std  # (B, 3, H, W)
         # a CPU gains from bf16 in dense 3 x 3 convolutions and loses in the trunk's depthwise ones; a GPU gains in all
         with self._autocast(image, image.device.type != "cpu"):
-            features = self._encode(x)
+            features = self._encode(x if self.detail is None else F.avg_pool2d(x, 2))
         with self._autocast(image):
+            features = [lateral(f) for lateral, f in zip(self.lateral, features, strict=True)]
+            if self.detail is not None:
+                features[0] = features[0] + self.detail(x)
             x = self._decode(features)
         return self.head(x.float())
 
@@ -86,7 +102,6 @@ class PyramidNetwork(nn.Module):
         return features
 
     def _decode(self, features: list[Tensor]) -> Tensor:
-        features = [lateral(f) for lateral, f in zip(self.lateral, features, strict=True)]
         levels = [self.context(self.merge[-1](features[-1]))]  # the coarsest first
         for feature, merge in zip(features[-2::-1], self.merge[-2::-1], strict=True):
             levels.append(merge(feature + _resize(levels[-1], feature)))
@@ -220,7 +235,8 @@ def build_network(
     ``pretrained`` starts lite0 from ImageNet; resnet34 does from the file ``trunk_weights`` where one is given.
     """
     if name in PASSES:
-        return PyramidNetwork(descriptor_dim, roles=roles, passes=PASSES[name], pretrained=pretrained)
+        passes, detail = PASSES[name], name in DETAILED
+        return PyramidNetwork(descriptor_dim, roles=roles, passes=passes, detail=detail, pretrained=pretrained)
     if name == "resnet34":
         network = ResNet34Network(descriptor_dim, roles=roles)
         if pretrained and trunk_weights:

@@ -25,7 +25,7 @@ from tqdm.auto import tqdm
 
 from mmgsd import distributed, losses
 from mmgsd.augmentation import Batch, load_training_images, make_batch
-from mmgsd.config import CONTRASTIVE, MATCHES_OF_ONE, PASSES, TrainConfig, from_dict
+from mmgsd.config import CONTRASTIVE, DETAILED, MATCHES_OF_ONE, PASSES, TrainConfig, from_dict
 from mmgsd.dataset import Dataset, hold_out, load_dataset
 from mmgsd.evaluation import calibrate_bandwidth, calibrate_temperature, measure_rmse
 from mmgsd.matching import Matcher, load
@@ -35,6 +35,7 @@ from mmgsd.network import (
     find_device,
     sample_descriptors,
 )
+from mmgsd.optimiser import make_optimisers
 from mmgsd.prototypes import compute_prototype_loss, make_prototypes
 
 WEIGHTS, CHECKPOINT, LOG = "weights.safetensors", "checkpoint.safetensors", "log.csv"
@@ -153,22 +154,21 @@ class _Run:
         start = make_prototypes(self.data.xy, known, config.descriptor_dim, math.hypot(*data.size))
         self.prototypes = torch.nn.Parameter(start.to(device))
         self.trained = [p for p in self.network.parameters() if p.requires_grad]
-        self.optimiser = torch.optim.AdamW(
-            [*self.trained, self.prototypes], lr=config.learning_rate, weight_decay=config.weight_decay, fused=True
-        )
+        self.optimisers = make_optimisers(self.network, [self.prototypes], config)
         self.step, self.seconds, self.saved_at, self.log = 0, 0.0, 0.0, []
 
     def advance(self) -> float:
         """One optimiser step; saves a checkpoint every ``CHECKPOINT_SECONDS``."""
         start = time.perf_counter()
-        for group in self.optimiser.param_groups:
-            group["lr"] = compute_learning_rate(self.config, self.step)
         self.network.train()
-        self.optimiser.zero_grad(set_to_none=True)
+        for optimiser in self.optimisers:
+            optimiser.param_groups[0]["lr"] = compute_learning_rate(self.config, self.step)
+            optimiser.zero_grad(set_to_none=True)
         loss = self.team.add(sum(self.learn(group) for group in self.team.groups))
         self.team.share_gradients([*self.trained, self.prototypes])
         torch.nn.utils.clip_grad_norm_(self.trained, 5.0)
-        self.optimiser.step()
+        for optimiser in self.optimisers:
+            optimiser.step()
         self.average.update_parameters(self.network)
         self.step += 1
         self.seconds += time.perf_counter() - start
@@ -222,8 +222,9 @@ class _Run:
         tensors = {"prototypes": self.prototypes.detach()}
         for part in ("network", "average"):
             tensors |= {f"{part}/{name}": value for name, value in getattr(self, part).state_dict().items()}
-        for index, values in self.optimiser.state_dict()["state"].items():
-            tensors |= {f"optimiser/{index}/{name}": value for name, value in values.items()}
+        for number, optimiser in enumerate(self.optimisers):
+            for index, values in optimiser.state_dict()["state"].items():
+                tensors |= {f"optimisers/{number}/{index}/{name}": value for name, value in values.items()}
         numbers = {"step": self.step, "seconds": self.seconds, "log": self.log}
         metadata = {"config": self._describe_config(), "numbers": json.dumps(numbers)}
         aside = self.folder / (CHECKPOINT + ".tmp")
@@ -242,19 +243,21 @@ class _Run:
         if metadata["config"] != self._describe_config():
             raise ValueError(f"{path} belongs to another configuration: choose another folder or overwrite=True")
         self.prototypes.data.copy_(tensors.pop("prototypes"))
-        parts = {"network": {}, "average": {}, "optimiser": {}}
+        parts = {"network": {}, "average": {}, "optimisers": {}}
         for name, value in tensors.items():
             part, rest = name.split("/", 1)
             parts[part][rest] = value
         self.network.load_state_dict(parts["network"])
         self.average.load_state_dict(parts["average"])
-        state, parameters = {}, self.optimiser.param_groups[0]["params"]
-        for name, value in parts["optimiser"].items():
-            index, field = name.split("/")
+        states = [{} for _ in self.optimisers]
+        for name, value in parts["optimisers"].items():
+            number, index, field = name.split("/")
             # the fused step takes for granted that moments lie in memory as their parameter does
-            value = torch.empty_like(parameters[int(index)]).copy_(value) if value.ndim else value
-            state.setdefault(int(index), {})[field] = value
-        self.optimiser.load_state_dict({**self.optimiser.state_dict(), "state": state})
+            like = self.optimisers[int(number)].param_groups[0]["params"][int(index)]
+            value = torch.empty_like(like).copy_(value) if value.ndim else value
+            states[int(number)].setdefault(int(index), {})[field] = value
+        for optimiser, state in zip(self.optimisers, states, strict=True):
+            optimiser.load_state_dict({**optimiser.state_dict(), "state": state})
         numbers = json.loads(metadata["numbers"])
         self.step, self.seconds, self.log = numbers["step"], numbers["seconds"], numbers["log"]
         self.saved_at = self.seconds
@@ -324,8 +327,8 @@ def _make_network(config: TrainConfig, models: Path) -> torch.nn.Module:
         trained = load(start, device="cpu")
         for name in ("network", "descriptor_dim", "roles"):
             theirs, asked = getattr(trained.config, name), getattr(config, name)
-            fewer_passes = name == "network" and PASSES.get(theirs, math.inf) <= PASSES[asked]
-            if theirs != asked and not fewer_passes:
+            within = name == "network" and PASSES.get(theirs, math.inf) <= PASSES[asked] and theirs not in DETAILED
+            if theirs != asked and not within:
                 raise ValueError(f"trunk_weights {start!r} has {name} {theirs!r}, the training {asked!r}")
         network.start_from(trained.network)
     return network

@@ -26,7 +26,7 @@ from mmgsd.config import (
 
 OTHER = {  # another accepted value for the fields that are no plain numbers or flags
     "object": "cloth", "method": "pcl", "group": "identity", "network": "lite0", "trunk_weights": "w.safetensors",
-    "schedule": "step", "rotation_deg": 45.0, "bend": 0.25, "groups": 2, "roles": 2,
+    "schedule": "step", "optimiser": "muon", "rotation_deg": 45.0, "bend": 0.25, "groups": 2, "roles": 2,
 }  # fmt: skip
 CONFIGS = (RenderConfig(object="rope"), TrainConfig(object="rope", network="resnet34"), EvaluateConfig(points=600))
 FIELDS = [(config, field.name) for config in CONFIGS for field in dataclasses.fields(config)]
@@ -98,7 +98,12 @@ def test_unknown_preset_names_the_accepted_ones() -> None:
         (TrainConfig, {"input_px": 32}, "input_px must be at least 64"),
         (TrainConfig, {"seed": -1}, "seed must be at least 0, got -1"),
         (TrainConfig, {"method": "mmgds"}, "method must be one of 'pcl', .*did you mean 'mmgsd'.*got 'mmgds'"),
-        (TrainConfig, {"network": "vgg"}, "network must be one of 'lite0', 'lite0x2', 'resnet34', got 'vgg'"),
+        (
+            TrainConfig,
+            {"network": "vgg"},
+            "network must be one of 'lite0', 'lite0x2', 'lite0x2fine', 'resnet34', got 'vgg'",
+        ),
+        (TrainConfig, {"optimiser": "adam"}, "optimiser must be one of 'adamw', 'muon' .did you mean 'adamw'"),
         (TrainConfig, {"schedule": "none"}, "schedule must be one of 'cosine', 'step'"),
         (RenderConfig, {"train_images": 0}, "train_images must be at least 1"),
         (RenderConfig, {"rotation_deg": 181.0}, r"rotation_deg must be in \(0, 180\], got 181"),

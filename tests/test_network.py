@@ -49,7 +49,7 @@ def test_resnet34_has_torchvisions_shapes() -> None:
 
 @pytest.mark.parametrize(("height", "width"), [(64, 64), (64, 96), (61, 75)])
 @pytest.mark.parametrize("roles", [1, 2])
-@pytest.mark.parametrize("name", ["lite0", "lite0x2", "resnet34"])
+@pytest.mark.parametrize("name", NETWORKS)
 def test_output_shape(name: str, roles: int, height: int, width: int) -> None:
     network = build_network(name, 5, roles=roles, pretrained=False).eval()
     with torch.no_grad():
@@ -112,7 +112,9 @@ def test_weights_of_something_else_are_named(tmp_path: Path) -> None:
 
 
 def test_unknown_network() -> None:
-    with pytest.raises(ValueError, match="network must be one of 'lite0', 'lite0x2', 'resnet34', got 'vgg'"):
+    with pytest.raises(
+        ValueError, match="network must be one of 'lite0', 'lite0x2', 'lite0x2fine', 'resnet34', got 'vgg'"
+    ):
         build_network("vgg", 3)
 
 

@@ -183,12 +183,14 @@ def test_weights_that_cannot_be_started_from(
     assert start.is_file()  # what is finished is deleted only where it can be made again
 
 
-def test_a_killed_run_ends_with_the_same_weights(cloth_dataset: Path, tmp_path: Path) -> None:
-    train_and_kill(LONGER, cloth_dataset, tmp_path / "killed")
+@pytest.mark.parametrize("optimiser", ["adamw", "muon"])
+def test_a_killed_run_ends_with_the_same_weights(cloth_dataset: Path, tmp_path: Path, optimiser: str) -> None:
+    config = dataclasses.replace(LONGER, optimiser=optimiser)
+    train_and_kill(config, cloth_dataset, tmp_path / "killed")
     assert not (tmp_path / "killed" / training.WEIGHTS).exists()
     assert json.loads(load_metadata(tmp_path / "killed" / CHECKPOINT)["numbers"])["step"] == HANG_IN_STEP
-    resumed = load_file(train(LONGER, cloth_dataset, tmp_path / "killed"))
-    undisturbed = load_file(train(LONGER, cloth_dataset, tmp_path / "undisturbed"))
+    resumed = load_file(train(config, cloth_dataset, tmp_path / "killed"))
+    undisturbed = load_file(train(config, cloth_dataset, tmp_path / "undisturbed"))
     torch.testing.assert_close(resumed, undisturbed, rtol=0, atol=0)
     assert pd.read_csv(tmp_path / "killed" / LOG).step.tolist() == list(range(1, LONGER.steps + 1))
 
