@@ -85,7 +85,7 @@ class PyramidNetwork(nn.Module):
         with self._autocast(image):
             features = [lateral(f) for lateral, f in zip(self.lateral, features, strict=True)]
             if self.detail is not None:
-                features[0] = features[0] + self.detail(x)
+                features[0] = features[0] + _resize(self.detail(x), features[0])
             x = self._decode(features)
         return self.head(x.float())
 

@@ -9,7 +9,7 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
-from mmgsd.config import NETWORKS
+from mmgsd.config import DETAILED, NETWORKS
 from mmgsd.network import (
     ResNet34Trunk,
     build_network,
@@ -52,6 +52,7 @@ def test_resnet34_has_torchvisions_shapes() -> None:
 @pytest.mark.parametrize("name", NETWORKS)
 def test_output_shape(name: str, roles: int, height: int, width: int) -> None:
     network = build_network(name, 5, roles=roles, pretrained=False).eval()
+    height, width = (side * (2 if name in DETAILED else 1) for side in (height, width))
     with torch.no_grad():
         descriptors = network(torch.rand(2, 3, height, width))
     assert descriptors.shape == (2, 5 * roles, height // network.stride, width // network.stride)
@@ -65,14 +66,15 @@ def test_every_used_parameter_gets_a_gradient(name: str) -> None:
     assert [n for n, p in network.named_parameters() if p.grad is None] == []
 
 
-def test_a_pass_put_onto_trained_ones_hardly_changes_their_answers() -> None:
+@pytest.mark.parametrize(("old", "new"), [("lite0", "lite0x2"), ("lite0x2", "lite0x2fine"), ("lite0", "lite0x2fine")])
+def test_what_is_put_onto_a_trained_network_hardly_changes_its_answers(old: str, new: str) -> None:
     torch.manual_seed(0)
-    trained = build_network("lite0", 4, roles=2).eval()
-    deeper = build_network("lite0x2", 4, roles=2, pretrained=False).eval()
+    trained = build_network(old, 4, roles=2).eval()
+    deeper = build_network(new, 4, roles=2, pretrained=False).eval()
     deeper.start_from(trained)
     image = torch.rand(1, 3, 64, 64)
     with torch.no_grad():
-        before, after = trained(image), deeper(image)
+        before, after = trained(image), deeper(torch.nn.functional.interpolate(image, scale_factor=deeper.stride // 4))
     gap = (after - before).std() / before.std()
     assert 0 < gap < 0.2
     assert all(torch.equal(deeper.state_dict()[name], value) for name, value in trained.state_dict().items())
@@ -82,6 +84,23 @@ def test_a_pass_is_not_dropped() -> None:
     deeper = build_network("lite0x2", 4, pretrained=False)
     with pytest.raises(ValueError, match="other must have at most 1 passes, got 2"):
         build_network("lite0", 4, pretrained=False).start_from(deeper)
+
+
+def test_detail_is_not_dropped() -> None:
+    detailed = build_network("lite0x2fine", 4, pretrained=False)
+    with pytest.raises(ValueError, match="other must have no detail, as this network has none"):
+        build_network("lite0x2", 4, pretrained=False).start_from(detailed)
+
+
+def test_detail_sees_what_the_trunk_cannot() -> None:
+    torch.manual_seed(0)
+    chequered = (torch.arange(64)[:, None] + torch.arange(64)) % 2 * torch.ones(1, 3, 1, 1)
+    grey = torch.full((1, 3, 64, 64), 0.5)
+    coarse, detailed = (build_network(name, 4, pretrained=False).eval() for name in ("lite0x2", "lite0x2fine"))
+    with torch.no_grad():
+        halves = [coarse(torch.nn.functional.avg_pool2d(image, 2)) for image in (chequered, grey)]
+        wholes = [detailed(image) for image in (chequered, grey)]
+    assert torch.equal(*halves) and not torch.allclose(*wholes, rtol=1e-3)
 
 
 def write_torchvision_weights(path: Path) -> dict[str, Tensor]:
