@@ -30,15 +30,16 @@ DETAILED = ("lite0x2fine",)  # whose trunk sees the image at half its size, a li
 NETWORKS = (*PASSES, "resnet34")  # the last is the contrastive papers' reference
 CONTRASTIVE_MARGIN = 4.0  # of the presets: with the reference's 0.5, lite0's descriptors collapse before they learn
 LONGER = 3  # times the steps of the main table: a model of its own, to see what more training gains
+ROUNDNESS_OF_SHARP = 0.05  # with which the sharper heatmaps of "mmgsd_muon" have the least error held out
 FINER = 1.5  # times the input, at least, on which another goes on from there
-LONGER_TRAINED = ("mmgsd_long", "mmgsd_fine", "mmgsd_fine_deep")  # these two, and one that goes on from them
+LONGER_TRAINED = ("mmgsd_long", "mmgsd_fine", "mmgsd_fine_deep", "mmgsd_muon")  # the 2nd and 3rd go on from the 1st
 REFERENCE = {  # Dense Object Nets' training (Florence et al. 2018): 3,500 steps of a pair of images as they are
     "network": "resnet34", "descriptor_dim": 3, "roles": 1, "batch": 2, "pairs": 1, "queries": 625, "margin": 0.5,
     "learning_rate": 1e-4, "schedule": "step", "weight_decay": 1e-4, "bend": 0.0, "augment": False,
 }  # fmt: skip
 OWN_STEPS = ("spcl_reference", *LONGER_TRAINED)  # models of the main table with another number of steps than the rest
 OPTIMISERS = ("adamw", "muon")
-ADDED = {"optimiser": "adamw"}  # fields that came later, and how it was done without them
+ADDED = {"optimiser": "adamw", "roundness": 0.2}  # fields that came later, and how it was done without them
 N_POINTS = 625  # material points of the cloth and the rope
 
 Config = TypeVar("Config", bound="RenderConfig | TrainConfig | EvaluateConfig")
@@ -135,6 +136,7 @@ class TrainConfig:
     non_matches: int = 150  # a match, half of them on the object (contrastive losses only)
     augment: bool = True
     bend: float = 0.0  # augmentation stretches and squeezes images along random waves, by up to this share
+    roundness: float = 0.2  # of the modes read from its heatmaps, a priori (`mmgsd.mixture.fit_modes`)
     rotate: bool = True  # augmentation turns images by any angle; off where the rotation limit is the experiment
     seed: int = 0
 
@@ -152,13 +154,14 @@ class TrainConfig:
             _check(name, getattr(self, name), "at least 1", getattr(self, name) >= 1)
         _check("roles", self.roles, "1 or 2", self.roles in (1, 2))
         _check("non_matches", self.non_matches, "at least 2 (on and off the object)", self.non_matches >= 2)
-        for name in ("learning_rate", "sigma_px", "sigma_start_px", "margin"):
+        for name in ("learning_rate", "sigma_px", "sigma_start_px", "margin", "roundness"):
             _check(name, getattr(self, name), "greater than 0", getattr(self, name) > 0)
         _check("batch", self.batch, "at least 2 (a pair)", self.batch >= 2)
         each = f"a divisor of batch and pairs that leaves at least 2 of {self.batch} images and a pair in each"
         divides = self.groups >= 1 and self.batch % self.groups == 0 == self.pairs % self.groups
         _check("groups", self.groups, each, divides and self.batch // self.groups >= 2)
-        _check("input_px", self.input_px, "at least 64", self.input_px >= 64)
+        least = 128 if self.network in DETAILED else 64  # px, of which the trunk sees 64
+        _check("input_px", self.input_px, f"at least {least} for {self.network!r}", self.input_px >= least)
         _check("bend", self.bend, "in [0, 0.5]", 0 <= self.bend <= 0.5)
         for name in ("weight_decay", "seed"):
             _check(name, getattr(self, name), "at least 0", getattr(self, name) >= 0)
@@ -216,12 +219,14 @@ class Preset:
         "spcl_deep": MMGSD, and SPCL with the dense supervision, in a network with a second pass over its pyramid;
         "mmgsd_long": MMGSD with `LONGER` times the steps; "mmgsd_fine": the latter after a quarter as many steps more,
         on larger images, with the method's own loss alone; "mmgsd_fine_deep": that one after as many again, with the
-        second pass put onto it.
+        second pass put onto it; "mmgsd_muon": from the start with both passes, a light branch that sees the image at
+        twice the size, another optimiser, and modes read with less of a prior, `LONGER` times the steps.
         """
         train = self.train[object]
         models = {method: dataclasses.replace(train, method=method) for method in METHODS}
         models |= {m: dataclasses.replace(models[m], margin=CONTRASTIVE_MARGIN) for m in CONTRASTIVE}
-        reference = {"input_px": 2 * train.input_px, "steps": max(1, train.steps * 7 // 8), **REFERENCE}
+        twice, sharp = {"input_px": 2 * train.input_px}, {"roundness": ROUNDNESS_OF_SHARP}
+        reference = {**twice, "steps": max(1, train.steps * 7 // 8), **REFERENCE}
         longer = dataclasses.replace(models["mmgsd"], steps=LONGER * train.steps)
         finer = {"input_px": math.ceil(FINER * train.input_px / 32) * 32, "steps": max(1, longer.steps // 4)}
         gentler = {"learning_rate": train.learning_rate / 2, "sigma_start_px": 8.0, "prototype_weight": 0.0}
@@ -235,6 +240,7 @@ class Preset:
             "mmgsd_long": longer,
             "mmgsd_fine": fine,
             "mmgsd_fine_deep": dataclasses.replace(fine, trunk_weights=fine.name, network="lite0x2"),
+            "mmgsd_muon": dataclasses.replace(longer, network="lite0x2fine", optimiser="muon", **twice, **sharp),
         }
 
     def budget_table(self, object: str) -> dict[str, TrainConfig]:

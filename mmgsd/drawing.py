@@ -28,6 +28,7 @@ METHOD_LABELS = {
     "mmgsd_plain": "MMGSD, plain", "mmgsd_deep": "MMGSD, deeper", "spcl_deep": "SPCL, deeper",
     "spcl_reference": "SPCL, reference",
     "mmgsd_long": "MMGSD, longer", "mmgsd_fine": "MMGSD, finer", "mmgsd_fine_deep": "MMGSD, finest",
+    "mmgsd_muon": "MMGSD, Muon",
     "sift": "SIFT", "orb": "ORB",
     "surf": "SURF", "akaze": "AKAZE", "daisy": "DAISY", "centre": "Object centre", "random": "Random points",
 }  # fmt: skip
@@ -35,6 +36,7 @@ METHOD_COLOURS = {
     "mmgsd": "#D55E00", "spcl": "#0072B2", "pcl": "#56B4E9", "unimodal": "#009E73", "spcl_dense": "#88CCEE",
     "mmgsd_plain": "#F0A070", "mmgsd_deep": "#B22222", "spcl_deep": "#4477CC", "spcl_reference": "#001F4D",
     "mmgsd_long": "#8A3500", "mmgsd_fine": "#4D1D00", "mmgsd_fine_deep": "#260F00",
+    "mmgsd_muon": "#FF3D00",
     "sift": "#CC79A7", "orb": "#999933",
     "surf": "#882255", "akaze": "#332288", "daisy": "#E69F00", "centre": "#404040", "random": "#9A9A9A",
 }  # fmt: skip

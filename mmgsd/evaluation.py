@@ -206,7 +206,8 @@ def _model_answer(matcher: Matcher, data: Dataset, config: EvaluateConfig) -> An
 
     def answer(first: int, second: int, xy: np.ndarray, n: np.ndarray) -> tuple[Mixture, Tensor]:
         heatmap = matcher.compute_heatmaps(descriptors[first], descriptors[second], torch.from_numpy(xy), data.size)
-        return read_heatmap(heatmap, torch.from_numpy(n), compute_cell_centres(data.size, heatmap.shape[-2:]))
+        centres = compute_cell_centres(data.size, heatmap.shape[-2:])
+        return read_heatmap(heatmap, torch.from_numpy(n), centres, roundness=matcher.config.roundness)
 
     return answer
 

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from mmgsd.config import CONTRASTIVE, TrainConfig, find_root, from_dict
 from mmgsd.losses import compute_squared_distances
-from mmgsd.mixture import Mixture, fit_modes
+from mmgsd.mixture import ROUNDNESS, Mixture, fit_modes
 from mmgsd.network import (
     build_network,
     compute_cell_centres,
@@ -215,7 +215,8 @@ class Pair:
         points = check_pixels(xy, size0)
         cells = self.matcher.compute_heatmaps(*self.descriptors, torch.from_numpy(points), size0)
         centres = compute_cell_centres(size1, cells.shape[-2:])
-        return make_match(self.image0, self.image1, points, cells, centres, self.matcher.modes if n is None else n)
+        n, roundness = self.matcher.modes if n is None else n, self.matcher.config.roundness
+        return make_match(self.image0, self.image1, points, cells, centres, n, roundness=roundness)
 
 
 def load(weights: Path | str, *, device: str = "") -> Matcher:
@@ -233,19 +234,22 @@ def load(weights: Path | str, *, device: str = "") -> Matcher:
 
 
 def make_match(
-    image0: np.ndarray, image1: np.ndarray, xy: np.ndarray, cells: Tensor, centres: tuple[Tensor, Tensor], n: int | str
-) -> Match:
+    image0: np.ndarray, image1: np.ndarray, xy: np.ndarray, cells: Tensor, centres: tuple[Tensor, Tensor], n: int | str,
+    *, roundness: float = ROUNDNESS,
+) -> Match:  # fmt: skip
     """The answer that heatmaps (S, h, w) with cell ``centres`` (w,), (h,) px hold, however they were made."""
-    fit, entropy = read_heatmap(cells, n, centres)
+    fit, entropy = read_heatmap(cells, n, centres, roundness=roundness)
     arrays = (t.cpu().numpy() for t in (fit.modes, fit.weights, fit.covariances, entropy, fit.outside, cells))
     return Match(image0, image1, xy, *arrays)
 
 
-def read_heatmap(heatmap: Tensor, n: int | str | Tensor, centres: tuple[Tensor, Tensor]) -> tuple[Mixture, Tensor]:
+def read_heatmap(
+    heatmap: Tensor, n: int | str | Tensor, centres: tuple[Tensor, Tensor], *, roundness: float = ROUNDNESS
+) -> tuple[Mixture, Tensor]:
     """Mixtures of ``n`` modes and entropies (S,) in nats of heatmaps (S, h, w) with cell ``centres`` (w,), (h,) px."""
     xs, ys = (c.float().to(heatmap.device) for c in centres)
     entropy = compute_entropy(heatmap.flatten(1), float((xs[1] - xs[0]) * (ys[1] - ys[0])))
-    return fit_modes(heatmap, n, xs, ys), entropy
+    return fit_modes(heatmap, n, xs, ys, roundness=roundness), entropy
 
 
 def check_question(

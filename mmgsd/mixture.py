@@ -24,7 +24,7 @@ KERNEL_CELLS = 1.0  # std of the kernel that finds the initial peaks, in cells t
 SPREAD = (1 / 12, 10 / 12, 1 / 12)  # of a cell's mass: to second order what bilinear interpolation to pixels does
 MIN_VARIANCE = 0.05  # cells²
 PRIOR_WEIGHT = 1.0  # heatmap mass by which each component is a priori as likely as any other
-PRIOR_SHAPE = 0.2  # heatmap mass by which each component is a priori round and as wide as their average
+ROUNDNESS = 0.2  # heatmap mass by which each component is a priori round and as wide as their average
 CHUNK = {"cpu": 2**21, "cuda": 2**26}  # numbers in the largest array of a fit
 MOST_MODES, SAMPLES = 8, 200  # n="auto": the most modes tried; a heatmap weighs as much as so many drawn pixels
 ELLIPSE = 5.991  # squared Mahalanobis distance of the ellipse that holds 95 % of a Gaussian in the plane
@@ -40,21 +40,33 @@ class Mixture:
     outside: Tensor  # (S,) mass of the heatmap outside every mode's 95 % ellipse
 
 
-def fit_modes(heatmap: Tensor, n: int | str | Tensor, xs: Tensor, ys: Tensor, *, cycles: int = CYCLES) -> Mixture:
+def fit_modes(
+    heatmap: Tensor,
+    n: int | str | Tensor,
+    xs: Tensor,
+    ys: Tensor,
+    *,
+    cycles: int = CYCLES,
+    roundness: float = ROUNDNESS,
+) -> Mixture:
     """Fit an n-modal Gaussian mixture to each heatmap by weighted expectation-maximisation.
 
     ``heatmap`` (S, h, w) not negative, ``n`` modes for all or (S,), or "auto" for what the Bayesian information
     criterion prefers; ``xs`` (w,) and ``ys`` (h,) cell centres in px. Symmetric modes are a priori equally likely,
-    round and equally wide: that decides which cell belongs to which mode, while the result holds the moments of the
-    mass itself. Raises ValueError for other shapes, n < 1 or another word.
+    round and equally wide, the latter two by a heatmap mass of ``roundness``: that decides which cell belongs to which
+    mode, while the result holds the moments of the mass itself. Raises ValueError for other shapes, n < 1, another
+    word, or ``roundness`` that is not greater than 0.
     """
     n, n_max = _check_fit(heatmap, n, xs, ys)
+    if not roundness > 0:
+        raise ValueError(f"roundness must be greater than 0, got {roundness!r}")
+    how = cycles, roundness
     heatmap = heatmap.float()
     total = heatmap.flatten(1).sum(-1, keepdim=True)
     mass = torch.where(total > 0, heatmap.flatten(1) / total.clamp(min=1e-30), 1 / (len(xs) * len(ys)))
     grid = heatmap.shape[1:]
     mass = _interpolate(mass, grid)
-    state = _choose_fit(mass, grid, cycles) if n is None else _fit(mass, n, n_max, grid, cycles)
+    state = _choose_fit(mass, grid, *how) if n is None else _fit(mass, n, n_max, grid, *how)
     outside = _measure_outside(mass, state, grid)
     order = state[..., 2].argsort(-1, descending=True)
     state = state.gather(1, order[..., None].expand_as(state))
@@ -73,15 +85,16 @@ def fit_modes(heatmap: Tensor, n: int | str | Tensor, xs: Tensor, ys: Tensor, *,
 # grid's centre, so that one regularisation suits every image size. Weight 0 marks a component that a query has not.
 
 
-def _fit(mass: Tensor, n: Tensor, n_max: int, grid: tuple[int, int], cycles: int) -> Tensor:
+def _fit(mass: Tensor, n: Tensor, n_max: int, grid: tuple[int, int], cycles: int, roundness: float) -> Tensor:
     """State of the fit to (S, C) mass, in chunks of queries: memory stays bounded."""
     coarse, coarse_grid = _halve(mass, grid)
     size = _get_chunk(n_max, coarse)
-    starts = [_anneal(*part, n_max, coarse_grid) for part in zip(coarse.split(size), n.split(size), strict=True)]
+    parts = zip(coarse.split(size), n.split(size), strict=True)
+    starts = [_anneal(*part, n_max, coarse_grid, roundness) for part in parts]
     state = torch.cat(starts) * mass.new_tensor([2, 2, 1, 4, 4, 4])
     state[..., 0] += 0.5 * (grid[1] % 2)  # an odd grid was halved with a column, or a row, of nothing
     state[..., 1] += 0.5 * (grid[0] % 2)
-    return _run_em(mass, state, _describe_cells(grid, mass.device), cycles)
+    return _run_em(mass, state, _describe_cells(grid, mass.device), cycles, roundness)
 
 
 def _get_chunk(n_max: int, mass: Tensor) -> int:
@@ -95,14 +108,14 @@ def _halve(mass: Tensor, grid: tuple[int, int]) -> tuple[Tensor, tuple[int, int]
     return half.flatten(1), half.shape[1:]
 
 
-def _anneal(mass: Tensor, n: Tensor, n_max: int, grid: tuple[int, int]) -> Tensor:
+def _anneal(mass: Tensor, n: Tensor, n_max: int, grid: tuple[int, int], roundness: float) -> Tensor:
     """State fitted to the flattened mass, less and less flattened."""
     state, cells = _start(mass, n, n_max, grid), _describe_cells(grid, mass.device)
     for temperature in ANNEALING:
         flat = mass ** (1 / temperature)
         flat /= flat.sum(-1, keepdim=True)
         for _ in range(ANNEALING_CYCLES):
-            state = _run_cycle(flat, state, cells)
+            state = _run_cycle(flat, state, cells, roundness)
     return state
 
 
@@ -147,13 +160,13 @@ def _describe_cells(grid: tuple[int, int], device: torch.device) -> Tensor:
     return torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y])
 
 
-def _run_em(mass: Tensor, state: Tensor, cells: Tensor, cycles: int) -> Tensor:
+def _run_em(mass: Tensor, state: Tensor, cells: Tensor, cycles: int, roundness: float) -> Tensor:
     """Iterate until at rest; then the moments of each component's share of the mass, without the priors."""
     size, moving = _get_chunk(state.shape[1], mass), torch.arange(len(mass), device=mass.device)
     for _ in range(cycles):
         moved = []
         for part in moving.split(size):
-            after = _run_cycle(mass[part], state[part], cells)
+            after = _run_cycle(mass[part], state[part], cells, roundness)
             moved.append((after - state[part])[..., :2].abs().amax((1, 2)) > TOLERANCE_CELLS)
             state[part] = after
         moving = moving[torch.cat(moved)]
@@ -165,25 +178,25 @@ def _run_em(mass: Tensor, state: Tensor, cells: Tensor, cycles: int) -> Tensor:
     return state
 
 
-def _run_cycle(mass: Tensor, state: Tensor, cells: Tensor) -> Tensor:
+def _run_cycle(mass: Tensor, state: Tensor, cells: Tensor, roundness: float) -> Tensor:
     """Two EM steps, a leap as far as their change of pace suggests, and a step that steadies it."""
-    first = _step(mass, state, cells)
-    second = _step(mass, first, cells)
+    first = _step(mass, state, cells, roundness)
+    second = _step(mass, first, cells, roundness)
     pace, change = first - state, second - 2 * first + state
     length = pace.flatten(1).norm(dim=1) / change.flatten(1).norm(dim=1).clamp(min=1e-12)
     length = length.clamp(1, LEAP)[:, None, None]
     leapt = state + 2 * length * pace + length**2 * change
     weight, a, b, c = leapt[..., 2:].unbind(-1)
     lawful = (a > MIN_VARIANCE) & (c > MIN_VARIANCE) & (a * c - b * b > MIN_VARIANCE**2) & (weight >= 0)
-    return _step(mass, torch.where(lawful.all(1)[:, None, None], leapt, second), cells)
+    return _step(mass, torch.where(lawful.all(1)[:, None, None], leapt, second), cells, roundness)
 
 
-def _step(mass: Tensor, state: Tensor, cells: Tensor) -> Tensor:
+def _step(mass: Tensor, state: Tensor, cells: Tensor, roundness: float) -> Tensor:
     """One step of EM with the priors."""
     mean, weight, covariance = _compute_moments(mass, state, cells).split([2, 1, 3], -1)
     width = 0.5 * (weight * covariance[..., ::2]).sum((1, 2)) / weight.sum((1, 2))  # (S,)
     average = width[:, None, None] * width.new_tensor([1.0, 0.0, 1.0])
-    covariance = (weight * covariance + PRIOR_SHAPE * average) / (weight + PRIOR_SHAPE)
+    covariance = (weight * covariance + roundness * average) / (weight + roundness)
     weight = (weight + PRIOR_WEIGHT) * (state[..., 2:3] > 0)
     return torch.cat([mean, weight / weight.sum(1, keepdim=True), covariance], -1)
 
@@ -219,11 +232,11 @@ def _compute_log_likelihood(mass: Tensor, state: Tensor, cells: Tensor) -> Tenso
     return (_compute_log_densities(state, cells).logsumexp(1) * mass).sum(-1)
 
 
-def _choose_fit(mass: Tensor, grid: tuple[int, int], cycles: int) -> Tensor:
+def _choose_fit(mass: Tensor, grid: tuple[int, int], cycles: int, roundness: float) -> Tensor:
     """State (S, 8, 6) with as many components as the Bayesian information criterion prefers."""
     cells, states, criteria = _describe_cells(grid, mass.device), [], []
     for n in range(1, MOST_MODES + 1):
-        state = _fit(mass, torch.full((len(mass),), n, device=mass.device), n, grid, cycles)
+        state = _fit(mass, torch.full((len(mass),), n, device=mass.device), n, grid, cycles, roundness)
         likelihood = SAMPLES * _compute_log_likelihood(mass, state, cells)
         criteria.append((6 * n - 1) * float(np.log(SAMPLES)) - 2 * likelihood)
         states.append(F.pad(state, (0, 0, 0, MOST_MODES - n)))

@@ -65,6 +65,8 @@ def test_any_model_of_the_main_table_is_found_by_its_name() -> None:
     deeper = preset.method("rope", "mmgsd_fine_deep")
     assert dataclasses.replace(deeper, network="lite0", trunk_weights=finer.trunk_weights) == finer
     assert deeper.trunk_weights == finer.name
+    muon = preset.method("rope", "mmgsd_muon")
+    assert (muon.steps, muon.input_px, muon.network) == (LONGER * preset.train["rope"].steps, 256, "lite0x2fine")
     assert preset.method("cloth", "spcl_dense").dense_weight == 1
     deep = preset.method("cloth", "spcl_deep")
     assert dataclasses.replace(deep, network="lite0") == preset.method("cloth", "spcl_dense")
@@ -95,7 +97,9 @@ def test_unknown_preset_names_the_accepted_ones() -> None:
         (TrainConfig, {"augment": 1}, "augment must be bool, got 1"),
         (TrainConfig, {"batch": 1}, "batch must be at least 2"),
         (TrainConfig, {"non_matches": 1}, "non_matches must be at least 2"),
-        (TrainConfig, {"input_px": 32}, "input_px must be at least 64"),
+        (TrainConfig, {"input_px": 32}, "input_px must be at least 64 for 'lite0', got 32"),
+        (TrainConfig, {"input_px": 96, "network": "lite0x2fine"}, "input_px must be at least 128 for 'lite0x2fine'"),
+        (TrainConfig, {"roundness": 0.0}, "roundness must be greater than 0, got 0.0"),
         (TrainConfig, {"seed": -1}, "seed must be at least 0, got -1"),
         (TrainConfig, {"method": "mmgds"}, "method must be one of 'pcl', .*did you mean 'mmgsd'.*got 'mmgds'"),
         (

@@ -233,6 +233,20 @@ def test_the_validation_error_is_that_of_the_queries(ask_oracle: object, cloth_d
     assert measure_rmse(matcher, load_dataset(cloth_dataset), pairs=3, points=CONFIG.points) == pytest.approx(7, 1e-5)
 
 
+def test_modes_are_read_as_round_as_the_training_says(cloth_dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = TrainConfig(input_px=64, descriptor_dim=4, roundness=0.07)
+    matcher = Matcher(build_network("lite0", 4, pretrained=False), config, modes=4, size=(485, 485), device="cpu")
+    asked, read = [], evaluation.read_heatmap
+
+    def listen(*arguments: object, roundness: float) -> tuple[Mixture, torch.Tensor]:
+        asked.append(roundness)
+        return read(*arguments, roundness=roundness)
+
+    monkeypatch.setattr(evaluation, "read_heatmap", listen)
+    measure_rmse(matcher, load_dataset(cloth_dataset), pairs=2, points=5)
+    assert asked == [0.07, 0.07]
+
+
 def test_temperature_of_overconfident_and_timid_heatmaps(cloth_dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Heatmaps are Gaussians of 20 px around points that are off the truth by a Gaussian of another std."""
     data, truth = load_dataset(cloth_dataset), {}

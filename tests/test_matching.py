@@ -13,8 +13,10 @@ from heatmaps import CELL_PX, CELLS, CORNERS, SIZE, draw_mixture, one_cell
 from PIL import Image
 from safetensors.torch import save_file
 
+from mmgsd import matching
 from mmgsd.config import TrainConfig
 from mmgsd.matching import Match, Matcher, compute_entropy, compute_heatmap, make_match, read_image
+from mmgsd.mixture import Mixture
 from mmgsd.network import build_network, compute_cell_centres
 
 CONFIG = TrainConfig(input_px=64, descriptor_dim=8)
@@ -57,6 +59,21 @@ def matcher() -> Matcher:
     """An untrained network: what comes out means nothing, and has the promised form."""
     torch.manual_seed(0)
     return Matcher(build_network("lite0", 8, pretrained=False), CONFIG, modes=4, size=SIZE, device="cpu")
+
+
+def test_modes_are_read_as_round_as_the_training_says(matcher: Matcher, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked, fit = [], matching.fit_modes
+
+    def listen(*arguments: object, roundness: float) -> Mixture:
+        asked.append(roundness)
+        return fit(*arguments, roundness=roundness)
+
+    monkeypatch.setattr(matching, "fit_modes", listen)
+    image = np.zeros((64, 64, 3), np.uint8)
+    matcher.match(image, image, [(5, 5)])
+    monkeypatch.setattr(matcher, "config", dataclasses.replace(CONFIG, roundness=0.07))
+    matcher.match(image, image, [(5, 5)])
+    assert asked == [0.2, 0.07]
 
 
 @pytest.fixture

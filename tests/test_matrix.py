@@ -171,7 +171,7 @@ def test_what_a_model_starts_from_is_trained_before_it(tiny_dataset: Callable[..
     preset = make_tiny(tiny_dataset, tmp_path)
     train = {"cloth": dataclasses.replace(preset.train["cloth"], steps=1, input_px=64), "rope": preset.train["rope"]}
     preset = dataclasses.replace(preset, train=train)
-    longer, finer, deeper = (preset.method("cloth", method) for method in LONGER_TRAINED)
+    longer, finer, deeper = (preset.method("cloth", method) for method in LONGER_TRAINED[:3])
     models = tmp_path / "data" / "generated" / "smoke" / "models"
     (_, rmse), *_ = run_tasks([deeper], preset, tmp_path)
     assert all((models / model.name / "weights.safetensors").is_file() for model in (longer, finer, deeper))

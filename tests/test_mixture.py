@@ -53,6 +53,19 @@ def test_weights_are_found_and_sorted() -> None:
     np.testing.assert_allclose(fit.weights[0], weights[order], atol=1e-3)
 
 
+def test_less_of_a_prior_keeps_a_narrow_mode_out_of_a_wide_one() -> None:
+    true = np.array([[200.0, 240.0], [290.0, 240.0]])
+    heatmap = (draw_mixture(true[:1], 8.0) + draw_mixture(true[1:], 60.0)) / 2
+    errors = [measure_errors(fit_modes(heatmap, 2, XS, YS, roundness=r).modes[0], true) for r in (0.05, 0.2, 5.0)]
+    assert errors[0].max() < errors[1].max() < errors[2].max()
+
+
+@pytest.mark.parametrize("roundness", [0.0, -1.0, float("nan")])
+def test_another_roundness_is_refused(roundness: float) -> None:
+    with pytest.raises(ValueError, match="roundness must be greater than 0, got"):
+        fit_modes(one_cell(3, 3), 1, XS, YS, roundness=roundness)
+
+
 def test_a_weak_mode_beside_a_strong_one_is_found() -> None:
     fit = fit_modes(draw_mixture(CORNERS, 8.0, np.array([0.2, 0.4, 0.1, 0.3])), 4, XS, YS)
     assert measure_errors(fit.modes[0], CORNERS).max() < 0.1

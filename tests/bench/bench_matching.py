@@ -24,7 +24,7 @@ from mmgsd.config import Paths, find_root, load_preset
 from mmgsd.dataset import load_dataset, sample_pairs
 from mmgsd.matching import Matcher, read_heatmap
 from mmgsd.metrics import compute_mode_errors
-from mmgsd.mixture import PRIOR_SHAPE, PRIOR_WEIGHT
+from mmgsd.mixture import PRIOR_WEIGHT, ROUNDNESS
 from mmgsd.network import compute_cell_centres
 from mmgsd.training import WEIGHTS
 
@@ -101,7 +101,7 @@ def fit_all_pixels(pixels, means):
         means = summed[:, 1:3] / count[:, None]
         inner = summed[:, [3, 4, 4, 5]].view(-1, 2, 2) - count[:, None, None] * means[:, :, None] * means[:, None]
         average = inner.diagonal(dim1=1, dim2=2).mean(-1).sum()
-        shapes = (inner + PRIOR_SHAPE * average * one) / (count + PRIOR_SHAPE)[:, None, None]
+        shapes = (inner + ROUNDNESS * average * one) / (count + ROUNDNESS)[:, None, None]
         weights = (count + PRIOR_WEIGHT) / (count + PRIOR_WEIGHT).sum()
         if (means - before).abs().max() < 1e-3:
             break
