@@ -35,8 +35,8 @@ def test_the_models_that_matter_most_come_first() -> None:
     steps = [m.steps for m in models]
     assert models[4] == load_preset("paper").budget_table("cloth")["mmgsd"]  # one model, two tables
     assert max(i for i, m in enumerate(models) if m.sigma_px == 16) == max(i for i, n in enumerate(steps) if n == 1000)
-    assert set(steps[4:30]) == {1000} and set(steps[30:42]) == {4000} and len(models) == 50
-    assert steps[42:50] == [3500] * 2 + [12000] * 2 + [3000] * 4
+    assert set(steps[4:30]) == {1000} and set(steps[30:42]) == {4000} and len(models) == 52
+    assert steps[42:52] == [3500] * 2 + [12000] * 2 + [3000] * 4 + [12000] * 2
     assert [m.trunk_weights for m in models[46:50]] == [m.name for m in models[44:48]]  # these are trained before
     assert len({m.name for m in models}) == len(models)
     assert {m.group for m in models if m.object == "cloth"} == {"c4", "v4", "d4"}
