@@ -30,6 +30,7 @@ DETAILED = ("lite0x2fine",)  # whose trunk sees the image at half its size, a li
 NETWORKS = (*PASSES, "resnet34")  # the last is the contrastive papers' reference
 CONTRASTIVE_MARGIN = 4.0  # of the presets: with the reference's 0.5, lite0's descriptors collapse before they learn
 LONGER = 3  # times the steps of the main table: a model of its own, to see what more training gains
+ROUNDNESS = 0.2  # heatmap mass by which modes are a priori round and equally wide
 ROUNDNESS_OF_SHARP = 0.05  # with which the sharper heatmaps of "mmgsd_muon" have the least error held out
 FINER = 1.5  # times the input, at least, on which another goes on from there
 LONGER_TRAINED = ("mmgsd_long", "mmgsd_fine", "mmgsd_fine_deep", "mmgsd_muon")  # the 2nd and 3rd go on from the 1st
@@ -136,8 +137,8 @@ class TrainConfig:
     non_matches: int = 150  # a match, half of them on the object (contrastive losses only)
     augment: bool = True
     bend: float = 0.0  # augmentation stretches and squeezes images along random waves, by up to this share
-    roundness: float = 0.2  # of the modes read from its heatmaps, a priori (`mmgsd.mixture.fit_modes`)
     rotate: bool = True  # augmentation turns images by any angle; off where the rotation limit is the experiment
+    roundness: float = ROUNDNESS  # of the modes read from its heatmaps, a priori (`mmgsd.mixture.fit_modes`)
     seed: int = 0
 
     def __post_init__(self) -> None:

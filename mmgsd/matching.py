@@ -15,9 +15,9 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from mmgsd.config import CONTRASTIVE, TrainConfig, find_root, from_dict
+from mmgsd.config import CONTRASTIVE, ROUNDNESS, TrainConfig, find_root, from_dict
 from mmgsd.losses import compute_squared_distances
-from mmgsd.mixture import ROUNDNESS, Mixture, fit_modes
+from mmgsd.mixture import Mixture, fit_modes
 from mmgsd.network import (
     build_network,
     compute_cell_centres,

@@ -16,6 +16,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from mmgsd.config import ROUNDNESS
+
 ANNEALING, ANNEALING_CYCLES = (4.0, 2.0), 6  # temperatures of the flattened heatmaps fitted first, on half the grid
 CYCLES = 60  # of three EM steps and a leap, at most; a query at rest is left alone
 TOLERANCE_CELLS = 0.0005  # the most that a mode at rest moves in a cycle
@@ -24,7 +26,6 @@ KERNEL_CELLS = 1.0  # std of the kernel that finds the initial peaks, in cells t
 SPREAD = (1 / 12, 10 / 12, 1 / 12)  # of a cell's mass: to second order what bilinear interpolation to pixels does
 MIN_VARIANCE = 0.05  # cells²
 PRIOR_WEIGHT = 1.0  # heatmap mass by which each component is a priori as likely as any other
-ROUNDNESS = 0.2  # heatmap mass by which each component is a priori round and as wide as their average
 CHUNK = {"cpu": 2**21, "cuda": 2**26}  # numbers in the largest array of a fit
 MOST_MODES, SAMPLES = 8, 200  # n="auto": the most modes tried; a heatmap weighs as much as so many drawn pixels
 ELLIPSE = 5.991  # squared Mahalanobis distance of the ellipse that holds 95 % of a Gaussian in the plane

@@ -20,11 +20,11 @@ import numpy as np
 import torch
 from sklearn.mixture import GaussianMixture
 
-from mmgsd.config import Paths, find_root, load_preset
+from mmgsd.config import ROUNDNESS, Paths, find_root, load_preset
 from mmgsd.dataset import load_dataset, sample_pairs
 from mmgsd.matching import Matcher, read_heatmap
 from mmgsd.metrics import compute_mode_errors
-from mmgsd.mixture import PRIOR_WEIGHT, ROUNDNESS
+from mmgsd.mixture import PRIOR_WEIGHT
 from mmgsd.network import compute_cell_centres
 from mmgsd.training import WEIGHTS
 
