@@ -17,7 +17,7 @@ PAPER = {"cloth": 32.4, "rope": 31.3}  # px, MMGSD's RMSE as the paper reports i
 LABELS = {
     "mmgsd": "**MMGSD** (ours)", "mmgsd_deep": "MMGSD, deeper network", "mmgsd_long": f"MMGSD, {LONGER} × the steps",
     "mmgsd_fine": "MMGSD, then larger images", "mmgsd_fine_deep": "MMGSD, then deeper network",
-    "mmgsd_muon": "MMGSD, Muon and a detail branch",
+    "mmgsd_muon": "MMGSD, Muon, detail branch",
     "mmgsd_plain": "MMGSD, own loss alone",
     "spcl_deep": "SPCL, dense, deeper network", "spcl_dense": "SPCL, dense supervision", "spcl": "SPCL",
     "spcl_reference": "SPCL, reference setting",
