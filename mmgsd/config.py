@@ -64,6 +64,19 @@ def _check_choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
     _check(name, value, f"one of {', '.join(map(repr, choices))}{hint}", value in choices)
 
 
+FLAGS = {"true": True, "yes": True, "on": True, "1": True, "false": False, "no": False, "off": False, "0": False}
+
+
+def read_flag(name: str, value: Any) -> bool:
+    """A flag from a boolean, 0 or 1, or its usual spellings ("true", "No", "off"); ValueError names it otherwise.
+
+    papermill hands ``-p overwrite false`` over as a string, which Python takes for true.
+    """
+    word = str(value).strip().lower()
+    _check(name, value, "true or false (yes, no, on, off, 1, 0)", word in FLAGS)
+    return FLAGS[word]
+
+
 _set_frozen = object.__setattr__  # a field named ``object`` hides the builtin inside a class body
 
 

@@ -1,0 +1,202 @@
+"""The one place that writes files whole or not at all, locks folders, and removes what is the project's own.
+
+A file is written under a temporary name beside its place, flushed to the disk and renamed. Temporary names carry the
+process that wrote them, so that what a killed one left behind is known, and removed by the next that writes there.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import socket
+import time
+import uuid
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+try:
+    import fcntl
+except ImportError:  # Windows: folders are not locked there
+    fcntl = None
+
+ASIDE = re.compile(r"\.(?P<name>.+)\.(?P<host>[^.]*)-(?P<pid>\d+)-[0-9a-f]{8}\.(aside|old)")
+
+
+class LockedError(RuntimeError):
+    """Another process works in a folder; the message names both."""
+
+
+class ForeignFileError(ValueError):
+    """A folder that is to be replaced holds something that is not the project's; the message names it."""
+
+
+class DamagedFileError(ValueError):
+    """A file is truncated or not of its format; the message names it and says what to do."""
+
+
+@contextmanager
+def writing(path: Path | str) -> Iterator[Path]:
+    """Give a temporary path to write; it takes the place of ``path`` at the end, or is removed after an exception.
+
+    Raises OSError, with ``path`` in its message, where the disk is full or the folder cannot be written.
+    """
+    path = Path(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        remove_leftovers(path.parent, path.name)
+        aside = name_aside(path)
+        try:
+            yield aside
+            _flush(aside)
+            os.replace(aside, path)
+            _flush(path.parent)
+        finally:
+            aside.unlink(missing_ok=True)
+    except OSError as error:
+        if str(path) in str(error):
+            raise
+        raise type(error)(error.errno, f"{error.strerror or error} while writing {path}") from error
+
+
+def write_bytes(path: Path | str, data: bytes) -> Path:
+    """Write a file whole or not at all; returns its path."""
+    with writing(path) as aside:
+        aside.write_bytes(data)
+    return Path(path)
+
+
+def write_text(path: Path | str, text: str) -> Path:
+    """Write UTF-8 text whole or not at all; returns the path."""
+    return write_bytes(path, text.encode())
+
+
+def write_json(path: Path | str, values: Any, *, indent: int | None = 1) -> Path:
+    """Write plain values as JSON, a newline at the end, whole or not at all; returns the path."""
+    return write_text(path, json.dumps(values, indent=indent) + "\n")
+
+
+def read_json(path: Path | str, *, remedy: str = "remove it, or get it anew") -> Any:
+    """Values of a JSON file, with or without a byte-order mark; DamagedFileError, which names it, where it is none."""
+    try:
+        return json.loads(Path(path).read_bytes().decode("utf-8-sig"))
+    except ValueError as error:  # wrong UTF-8 and wrong JSON are both
+        raise DamagedFileError(f"{path} is damaged or no JSON ({error}): {remedy}") from error
+
+
+def name_aside(path: Path, kind: str = "aside") -> Path:
+    """A temporary name beside ``path`` that no other process, thread or machine takes."""
+    host = re.sub("[^A-Za-z0-9_]", "_", socket.gethostname())
+    return path.with_name(f".{path.name}.{host}-{os.getpid()}-{uuid.uuid4().hex[:8]}.{kind}")
+
+
+def remove_leftovers(folder: Path, name: str = "") -> None:
+    """Remove what killed processes of this machine left in ``folder``: of the file ``name``, or of every file."""
+    for path in folder.glob(f".{name or '*'}.*.*"):
+        found = ASIDE.fullmatch(path.name)
+        if found and (not name or found["name"] == name) and not _is_running(found["host"], int(found["pid"])):
+            _remove(path)
+
+
+def set_aside(path: Path) -> Path:
+    """Rename a damaged intermediate file so that it is made again; returns where it is now."""
+    target = path.with_name(f"{path.name}.damaged")
+    os.replace(path, target)
+    return target
+
+
+def remove_folder(folder: Path, is_ours: Callable[[Path], bool]) -> None:
+    """Remove a folder of the project's files; a no-op where there is none.
+
+    ``is_ours`` is asked of every file's path relative to it. Nothing is touched where it denies one: ForeignFileError.
+    The folder is renamed first, so that a kill leaves all of it or nothing under its name.
+    """
+    if not folder.exists():
+        return
+    check_ours(folder, is_ours)
+    remove_leftovers(folder.parent, folder.name)
+    old = name_aside(folder, "old")
+    os.replace(folder, old)
+    shutil.rmtree(old)
+
+
+def replace_folder(finished: Path, folder: Path, is_ours: Callable[[Path], bool]) -> None:
+    """Put the folder ``finished`` in the place of ``folder``, whose files must all be ours (see `remove_folder`)."""
+    old = None
+    if folder.exists():
+        check_ours(folder, is_ours)
+        old = name_aside(folder, "old")
+        os.replace(folder, old)
+    os.replace(finished, folder)
+    _flush(folder.parent)
+    if old:
+        shutil.rmtree(old)
+    remove_leftovers(folder.parent, folder.name)
+
+
+def check_ours(folder: Path, is_ours: Callable[[Path], bool]) -> None:
+    """ForeignFileError where a folder holds a file that ``is_ours`` denies, or is a link or a file itself."""
+    if folder.is_symlink() or not folder.is_dir():
+        raise ForeignFileError(f"{folder} is a link or a file, not our folder: move it, or choose another place")
+    for path in sorted(folder.rglob("*")):
+        if path.is_symlink() or (path.is_file() and not is_ours(path.relative_to(folder))):
+            raise ForeignFileError(f"{path} is none of this project's files: move it away, or choose another folder")
+
+
+@contextmanager
+def locked(folder: Path, doing: str) -> Iterator[None]:
+    """Hold a folder, which need not exist, for this process alone; LockedError names who holds it, and ``doing`` what.
+
+    The lock ends with the process, however it ends. It lies beside the folder: ``.NAME.lock``.
+    """
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    path = folder.with_name(f".{folder.name}.lock")
+    with open(path, "a+") as file:
+        try:
+            if fcntl:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            file.seek(0)
+            raise LockedError(f"{folder} is in use by {file.read().strip() or 'another process'}: wait for it, "
+                              "or stop it") from None  # fmt: skip
+        file.truncate(0)
+        file.write(f"process {os.getpid()} on {socket.gethostname()}, {doing} since {time.strftime('%F %T')}\n")
+        file.flush()
+        try:
+            yield
+        finally:
+            file.truncate(0)
+
+
+def _is_running(host: str, pid: int) -> bool:
+    """Whether the process may be alive: of another machine that is not known."""
+    if host != re.sub("[^A-Za-z0-9_]", "_", socket.gethostname()):
+        return True
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def _flush(path: Path) -> None:
+    """Have the system write a file, or a folder's entries, to the disk."""
+    if path.is_dir() and os.name != "posix":
+        return
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
