@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from mmgsd.config import DETAILED, NETWORKS, PASSES
+from mmgsd.heads import Heads, Outputs
 
 QUIET = 0.1  # scale of what a pass adds that is put onto trained ones: their answers hardly change at first
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
@@ -26,14 +27,15 @@ class PyramidNetwork(nn.Module):
 
     ``passes`` over the pyramid: the first upwards, each further one (`PyramidPass`) down and up again. With ``detail``
     the trunk sees the image at half its size, and three convolutions add what they find at the whole, the edges of a
-    fold, to the pyramid's finest level; the descriptors are then (B, roles * D, H / 8, W / 8).
+    fold, to the pyramid's finest level; the descriptors are then (B, roles * D, H / 8, W / 8). With ``heads`` it also
+    says where the object is, what is seen and whether it is there at all (`describe`).
     """
 
     reduced_precision = True  # bfloat16 where that is faster
 
     def __init__(
-        self, descriptor_dim: int, *, roles: int = 1, passes: int = 1, detail: bool = False, width: int = 96,
-        pretrained: bool = True,
+        self, descriptor_dim: int, *, roles: int = 1, passes: int = 1, detail: bool = False, heads: bool = False,
+        width: int = 96, pretrained: bool = True,
     ) -> None:  # fmt: skip
         super().__init__()
         self.trunk = EfficientNet.from_name("efficientnet-lite0")
@@ -51,6 +53,7 @@ class PyramidNetwork(nn.Module):
         self.stride = 8 if detail else 4  # of the descriptors' grid, in px of the input
         self.detail = nn.Sequential(*(_conv_block(a, b, stride=2) for a, b in pairwise(sizes))) if detail else None
         self.head = _make_head(width, descriptor_dim, roles)
+        self.heads = Heads(width, descriptor_dim, roles, sizes[2:0:-1] if detail else ()) if heads else None
         _register_normalisation(self)
 
     def train(self, mode: bool = True) -> PyramidNetwork:
@@ -62,7 +65,7 @@ class PyramidNetwork(nn.Module):
         return self
 
     def start_from(self, other: PyramidNetwork) -> None:
-        """Take the weights of a network with as many passes, or fewer, and no detail where this one has none.
+        """Take the weights of a network with as many passes, or fewer, and no detail or heads where this one has none.
 
         ValueError for another.
         """
@@ -70,6 +73,8 @@ class PyramidNetwork(nn.Module):
             raise ValueError(f"other must have at most {len(self.again) + 1} passes, got {len(other.again) + 1}")
         if self.detail is None and other.detail is not None:
             raise ValueError("other must have no detail, as this network has none")
+        if self.heads is None and other.heads is not None:
+            raise ValueError("other must have no heads, as this network has none")
         for added in self.again[len(other.again) :]:
             torch.nn.init.constant_(added.merge[-1][1].weight, QUIET)
         if self.detail is not None and other.detail is None:
@@ -78,16 +83,32 @@ class PyramidNetwork(nn.Module):
 
     def forward(self, image: Tensor) -> Tensor:
         """Dense descriptors, not normalised: their distance carries the temperature."""
+        return self._run(image, with_heads=False).descriptors
+
+    def describe(self, image: Tensor) -> Outputs:
+        """Descriptors, and what the heads say where the network has any."""
+        return self._run(image, with_heads=self.heads is not None)
+
+    def _run(self, image: Tensor, *, with_heads: bool) -> Outputs:
         x = (image - self.mean) / self.std  # (B, 3, H, W)
         # a CPU gains from bf16 in dense 3 x 3 convolutions and loses in the trunk's depthwise ones; a GPU gains in all
         with self._autocast(image, image.device.type != "cpu"):
             features = self._encode(x if self.detail is None else F.avg_pool2d(x, 2))
         with self._autocast(image):
-            features = [lateral(f) for lateral, f in zip(self.lateral, features, strict=True)]
+            features, finer = [lateral(f) for lateral, f in zip(self.lateral, features, strict=True)], []
             if self.detail is not None:
-                features[0] = features[0] + _resize(self.detail(x), features[0])
-            x = self._decode(features)
-        return self.head(x.float())
+                finer = self._find_detail(x)
+                features[0] = features[0] + _resize(finer[-1], features[0])
+            levels = self._decode(features)
+            said = self.heads(levels[-1], levels[0], finer[-2::-1]) if with_heads else ()
+        return Outputs(self.head(levels[-1].float()), *said)
+
+    def _find_detail(self, x: Tensor) -> list[Tensor]:
+        """What the light branch finds after each of its convolutions, the finest first."""
+        found = [x]
+        for block in self.detail:
+            found.append(block(found[-1]))
+        return found[1:]
 
     def _autocast(self, image: Tensor, wanted: bool = True) -> torch.autocast:
         return torch.autocast(image.device.type, torch.bfloat16, enabled=wanted and self.reduced_precision)
@@ -101,13 +122,14 @@ class PyramidNetwork(nn.Module):
                 features.append(x)
         return features
 
-    def _decode(self, features: list[Tensor]) -> Tensor:
+    def _decode(self, features: list[Tensor]) -> list[Tensor]:
+        """The pyramid's levels, the coarsest first."""
         levels = [self.context(self.merge[-1](features[-1]))]  # the coarsest first
         for feature, merge in zip(features[-2::-1], self.merge[-2::-1], strict=True):
             levels.append(merge(feature + _resize(levels[-1], feature)))
         for again in self.again:
             levels = again(levels)
-        return levels[-1]
+        return levels
 
 
 class PyramidPass(nn.Module):
@@ -171,6 +193,10 @@ class ResNet34Network(nn.Module):
         size = [side // self.stride for side in image.shape[-2:]]
         return F.interpolate(self.head(x.float()), size, mode="bilinear", align_corners=False)
 
+    def describe(self, image: Tensor) -> Outputs:
+        """Descriptors; this network has no heads."""
+        return Outputs(self(image))
+
     def load_trunk(self, path: Path | str) -> None:
         """Read ImageNet weights of torchvision's ResNet-34 (safetensors); its classifier ``fc.*`` is left out.
 
@@ -228,15 +254,16 @@ class BasicBlock(nn.Module):
 
 
 def build_network(
-    name: str, descriptor_dim: int, *, roles: int = 1, pretrained: bool = True, trunk_weights: Path | str = ""
-) -> PyramidNetwork | ResNet34Network:
+    name: str, descriptor_dim: int, *, roles: int = 1, heads: bool = False, pretrained: bool = True,
+    trunk_weights: Path | str = "",
+) -> PyramidNetwork | ResNet34Network:  # fmt: skip
     """The network of a name in `NETWORKS` with D channels for each of 1 or 2 roles; ValueError for another name.
 
     ``pretrained`` starts lite0 from ImageNet; resnet34 does from the file ``trunk_weights`` where one is given.
     """
     if name in PASSES:
-        passes, detail = PASSES[name], name in DETAILED
-        return PyramidNetwork(descriptor_dim, roles=roles, passes=passes, detail=detail, pretrained=pretrained)
+        parts = {"passes": PASSES[name], "detail": name in DETAILED, "heads": heads}
+        return PyramidNetwork(descriptor_dim, roles=roles, pretrained=pretrained, **parts)
     if name == "resnet34":
         network = ResNet34Network(descriptor_dim, roles=roles)
         if pretrained and trunk_weights:
