@@ -33,6 +33,7 @@ class TrainingImages:
     visible: np.ndarray  # (N, P) bool
     size: tuple[int, int]  # full (W, H) px
     mirror: np.ndarray | None = None  # (P,) where each point goes in a mirror image
+    present: np.ndarray | None = None  # (N,) bool, images that show the object; None: all of them
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ class Batch:
     mask: Tensor  # (B, h, w) bool
     xy: Tensor  # (B, P, 2) full-image px
     askable: Tensor  # (B, P) bool, points visible and inside
-    inside: Tensor  # (B, P) bool
+    inside: Tensor  # (B, P) bool, visible or not; none where the object is not present
 
 
 @dataclass(frozen=True)
@@ -162,7 +163,7 @@ def load_training_images(data: Dataset, input_px: int, *, indices: np.ndarray | 
     with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
         images, masks = zip(*pool.map(load, indices), strict=True)
     labels = data.xy[indices], data.visible[indices]
-    return TrainingImages(list(images), list(masks), *labels, data.size, data.mirror)
+    return TrainingImages(list(images), list(masks), *labels, data.size, data.mirror, data.present[indices])
 
 
 def make_batch(
@@ -188,6 +189,8 @@ def make_batch(
         points.append(warp.move(xy))
     xy = np.stack(points)
     inside = np.all((xy > -0.5) & (xy < np.array(images.size) - 0.5), axis=-1)
+    if images.present is not None:  # an absent object has no matches
+        inside &= images.present[indices][:, None]
     image = torch.from_numpy(np.stack(pixels)).to(device).permute(0, 3, 1, 2).float() / 255
     tensors = (torch.from_numpy(a).to(device) for a in (np.stack(masks), xy.astype(np.float32)))
     askable = torch.from_numpy(inside & visible).to(device)

@@ -1,4 +1,4 @@
-"""One frozen dataclass for each stage, and the presets ``smoke``, ``quick`` and ``paper``.
+"""One frozen dataclass for each stage, and the presets ``smoke``, ``quick``, ``paper`` and ``workspace``.
 
 A configuration is everything that decides a result. How it is computed (workers, scheduler address, overwrite) is
 an argument of the stage, never part of its configuration.
@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 OBJECTS = ("cloth", "rope")
+SCENES = ("plain", "workspace")  # a patterned floor alone, or a robotics lab's table and what lies about on it
 METHODS = ("pcl", "spcl", "unimodal", "mmgsd")
 CONTRASTIVE = ("pcl", "spcl")  # the others are distributional
 MATCHES_OF_ONE = ("pcl", "unimodal")  # methods that are taught the identity only
@@ -40,7 +41,7 @@ REFERENCE = {  # Dense Object Nets' training (Florence et al. 2018): 3,500 steps
 }  # fmt: skip
 OWN_STEPS = ("spcl_reference", *LONGER_TRAINED)  # models of the main table with another number of steps than the rest
 OPTIMISERS = ("adamw", "muon")
-ADDED = {"optimiser": "adamw", "roundness": 0.2}  # fields that came later, and how it was done without them
+ADDED = {"optimiser": "adamw", "roundness": 0.2, "scene": "plain"}  # later fields, and how it was done without them
 N_POINTS = 625  # material points of the cloth and the rope
 
 Config = TypeVar("Config", bound="RenderConfig | TrainConfig | EvaluateConfig")
@@ -94,7 +95,11 @@ def _check_types(config: Any) -> None:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RenderConfig:
-    """What a rendered data set holds."""
+    """What a rendered data set holds.
+
+    ``scene`` says what is seen around the object: "plain", a floor; "workspace", tables, boards, mats, tools and hands
+    under hard light, seen obliquely, with prints, hems and stickers on the object, or without it (`mmgsd.scene`).
+    """
 
     object: str = "cloth"  # or "rope", or the name of a file in data/objects (see `mmgsd.sheet`)
     train_images: int = 60
@@ -103,6 +108,7 @@ class RenderConfig:
     samples: int = 1  # Cycles samples a pixel, denoised
     rotation_deg: float = 180.0  # the object is turned by an angle from ± this; 45 is prior work's fix (cloth)
     ball: bool = False  # a ball at the rope's first end: prior work's way to break its symmetry
+    scene: str = "plain"  # or "workspace"
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -112,6 +118,7 @@ class RenderConfig:
             _check(name, getattr(self, name), "at least 1", getattr(self, name) >= 1)
         _check("rotation_deg", self.rotation_deg, "in (0, 180]", 0 < self.rotation_deg <= 180)
         _check("ball", self.ball, "False for a cloth", not self.ball or self.object == "rope")
+        _check_choice("scene", self.scene, SCENES)
         _check("seed", self.seed, "at least 0", self.seed >= 0)
 
     @property
@@ -277,13 +284,13 @@ class Preset:
 
 
 def _preset(
-    name: str, *, views: dict, train: dict, rope: dict, ablation: dict, evaluate: dict, sigmas: tuple, **images: int
+    name: str, *, views: dict, train: dict, rope: dict, ablation: dict, evaluate: dict, sigmas: tuple, **render: Any
 ) -> Preset:
     cloth_train = TrainConfig(object="cloth", **train)
     rope_train = TrainConfig(object="rope", **{**train, **rope})
     return Preset(
         name=name,
-        render={o: RenderConfig(object=o, views=views[o], **images) for o in OBJECTS},
+        render={o: RenderConfig(object=o, views=views[o], **render) for o in OBJECTS},
         train={"cloth": cloth_train, "rope": rope_train},
         evaluate=EvaluateConfig(**evaluate),
         ablation={t.object: dataclasses.replace(t, **ablation) for t in (cloth_train, rope_train)},
@@ -292,7 +299,7 @@ def _preset(
 
 
 def load_preset(name: str) -> Preset:
-    """The preset ``smoke``, ``quick`` or ``paper``; ValueError for any other name."""
+    """The preset ``smoke``, ``quick``, ``paper`` or ``workspace``; ValueError for any other name."""
     _check_choice("preset", name, tuple(PRESETS))
     return PRESETS[name]
 
@@ -319,17 +326,28 @@ PRESETS = {
         ablation={"steps": 1000}, sigmas=(1.0, 2.0, 4.0, 8.0, 16.0),
         evaluate={"pairs": 500, "points": 625},
     ),
+    "workspace": _preset(
+        "workspace",
+        train_images=3500, test_images=500, views={"cloth": 5, "rope": 10}, scene="workspace",
+        train={"steps": 4000, "bend": 0.5, "roles": 2}, rope={"input_px": 160},
+        ablation={"steps": 1000}, sigmas=(1.0, 2.0, 4.0, 8.0, 16.0),
+        evaluate={"pairs": 500, "points": 625},
+    ),
 }  # fmt: skip
 
 
 def digest(config: Config) -> str:
     """Eight hexadecimal digits that differ where any field of the configuration differs.
 
-    A field of `ADDED` counts only where it is not as before there was one: models keep their names.
+    Models keep their names where a field of `ADDED` is as it was before there was one.
     """
-    values = {name: value for name, value in dataclasses.asdict(config).items() if value != ADDED.get(name)}
-    text = json.dumps(values, sort_keys=True)
+    text = json.dumps(to_dict(config), sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:8]
+
+
+def to_dict(config: Config) -> dict[str, Any]:
+    """All fields of a configuration but those of `ADDED` that are as before there was one: what is stored of it."""
+    return {name: value for name, value in dataclasses.asdict(config).items() if value != ADDED.get(name)}
 
 
 def from_dict(kind: type[Config], values: dict[str, Any]) -> Config:

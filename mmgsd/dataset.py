@@ -1,7 +1,8 @@
 """The data set on disk: its format, its checker and reader, and how pairs of images are drawn from it.
 
 dataset.json      object, image size, symmetry groups, mirror (optional), seed, versions, number of images of each split
-labels.parquet    one row an image: file, mask, split, episode, view, xy, visible, intrinsics, camera_pose, state …
+labels.parquet    one row an image: file, mask, split, episode, view, xy, visible, intrinsics, camera_pose, state …;
+                  present (optional), False where the object is not there: no visible point, an empty mask
 images/*.webp     lossless colour images          masks/*.png    1-bit object masks
 """
 
@@ -35,7 +36,8 @@ class DatasetError(ValueError):
 class Dataset:
     """One split of a data set, labels in memory, images read when asked for.
 
-    ``xy`` (N, P, 2) px, ``visible`` (N, P) bool, ``episode`` (N,) simulation of each image; P is 625 of cloth or rope.
+    ``xy`` (N, P, 2) px, ``visible`` (N, P) bool, ``episode`` (N,) simulation of each image, ``present`` (N,) whether it
+    shows the object; P is 625 of cloth or rope.
     """
 
     folder: Path
@@ -75,6 +77,11 @@ class Dataset:
     def episode(self) -> np.ndarray:
         """(N,) int, the simulation that each image shows."""
         return self.labels.episode.to_numpy()
+
+    @cached_property
+    def present(self) -> np.ndarray:
+        """(N,) bool, whether an image shows the object at all; True where the labels do not say."""
+        return self.labels.get("present", pd.Series(True, self.labels.index)).to_numpy(bool)
 
     @property
     def fingerprint(self) -> str:
@@ -165,33 +172,37 @@ def hold_out(data: Dataset, *, share: float = 0.05) -> tuple[Dataset, Dataset]:
 
 
 def measure_images(data: Dataset) -> pd.DataFrame:
-    """What the images of a split are like, one row an image.
+    """What the images of a split are like, one row an image that shows the object.
 
     ``state``, the ``visible`` share of the material points, and the median colours (3,) of the pixels on and off the
     object's mask, ``object_colour`` and ``background_colour``.
     """
     rows = []
-    for index in range(len(data)):
+    shown = np.flatnonzero(data.present)
+    for index in shown:
         image, mask = data.load_image(index), data.load_mask(index)
         colours = {"object_colour": np.median(image[mask], 0), "background_colour": np.median(image[~mask], 0)}
         rows.append({"visible": data.visible[index].mean(), **colours})
-    state = data.labels.get("state", "unknown")
+    state = data.labels.state.to_numpy()[shown] if "state" in data.labels else "unknown"
     return pd.DataFrame(rows).assign(state=state)
 
 
 def sample_pairs(
-    episode: np.ndarray, n_pairs: int, rng: np.random.Generator, *, same_episode: bool = False
-) -> np.ndarray:
+    episode: np.ndarray, n_pairs: int, rng: np.random.Generator, *, same_episode: bool = False,
+    present: np.ndarray | None = None,
+) -> np.ndarray:  # fmt: skip
     """Draw ``n_pairs`` ordered pairs of different images, of different simulations unless ``same_episode``.
 
-    Returns (n_pairs, 2) int; without repetition while the images suffice. ValueError where no pair exists.
+    Only of images that are ``present`` (N,) bool, where that is given: those that show the object. Returns (n_pairs, 2)
+    int; without repetition while the images suffice. ValueError where no pair exists.
     """
-    first, second = np.nonzero(~np.eye(len(episode), dtype=bool))
+    able = np.ones(len(episode), dtype=bool) if present is None else np.asarray(present, dtype=bool)
+    first, second = np.nonzero(~np.eye(len(episode), dtype=bool) & able & able[:, None])
     if not same_episode and len(np.unique(episode)) > 1:
         keep = episode[first] != episode[second]
         first, second = first[keep], second[keep]
     if len(first) == 0:
-        raise ValueError(f"episode must hold at least 2 images to make a pair, got {len(episode)}")
+        raise ValueError(f"episode must hold at least 2 images to make a pair, got {able.sum()}")
     picked = rng.choice(len(first), n_pairs, replace=n_pairs > len(first))
     return np.stack([first[picked], second[picked]], axis=1)
 
@@ -262,9 +273,13 @@ def _read_labels(path: Path, info: dict) -> pd.DataFrame:
 
 
 def _check_labels_on_mask(data: Dataset, index: int, mask: np.ndarray) -> None:
-    """Visible points must lie on the object, but for a few at its very edge."""
+    """Visible points must lie on the object, but for a few at its very edge; there are none where it is not present."""
     name, (width, height) = data.labels["mask"].iloc[index], data.size
     xy, visible = data.xy[index], data.visible[index]
+    if not data.present[index]:
+        if visible.any() or mask.any():
+            raise DatasetError(f"{data.folder / name}: the object is said not to be present, but is seen")
+        return
     if not visible.any():
         raise DatasetError(f"{data.folder / name}: no material point is visible")
     column, row = np.rint(xy[visible]).astype(int).T

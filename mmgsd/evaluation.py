@@ -135,7 +135,7 @@ def calibrate_temperature(
 
     ``data`` must not have been trained on. Leaves it set on the matcher and returns it.
     """
-    chosen = sample_pairs(data.episode, pairs, np.random.default_rng(seed))
+    chosen = sample_pairs(data.episode, pairs, np.random.default_rng(seed), present=data.present)
     descriptors, points = _describe(matcher, data, np.unique(chosen)), choose_points(points, data.n_points)
     orbits = data.group(matcher.config.group).permutations[:, points].T  # (S, G)
     matcher.temperature, logits, true = 1.0, [], []
@@ -197,8 +197,8 @@ def _ask(
 
 
 def _draw_pairs(data: Dataset, config: EvaluateConfig) -> np.ndarray:
-    """(pairs, 2) images of different simulations."""
-    return sample_pairs(data.episode, config.pairs, np.random.default_rng(config.seed))
+    """(pairs, 2) images of different simulations that show the object."""
+    return sample_pairs(data.episode, config.pairs, np.random.default_rng(config.seed), present=data.present)
 
 
 def _model_answer(matcher: Matcher, data: Dataset, config: EvaluateConfig) -> Answer:

@@ -53,7 +53,7 @@ def make_scenes(data: Dataset, *, pairs: int = 50, seed: int = 0) -> list[Callab
         seen = np.where(data.visible[first][:, None], data.xy[first], np.inf)
         return Scene(*images, title, data.load_mask(second), seen, orbits)
 
-    chosen = sample_pairs(data.episode, pairs, np.random.default_rng(seed))
+    chosen = sample_pairs(data.episode, pairs, np.random.default_rng(seed), present=data.present)
     return [lambda a=int(a), b=int(b): make(a, b) for a, b in chosen]
 
 

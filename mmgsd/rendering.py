@@ -25,13 +25,14 @@ import pandas as pd
 from dask.distributed import Client, LocalCluster, as_completed
 from tqdm.auto import tqdm
 
-from mmgsd.config import DEFAULT_GROUP, OBJECTS, OWN_GROUP, RenderConfig, find_root
+from mmgsd.config import DEFAULT_GROUP, OBJECTS, OWN_GROUP, RenderConfig, find_root, to_dict
 from mmgsd.dataset import FORMAT, SPLITS, load_dataset
 from mmgsd.sheet import Sheet, load_sheet
 from mmgsd.symmetry import GRID_GROUPS, LINE_GROUPS, load_group, load_mirror
 
 IMAGES_A_BATCH = 30  # a child process ends after about so many, which bounds its memory
 SCENES = {"cloth": 2, "rope": 1}  # to be raised where the same configuration gives another object than before
+WORKSPACES = 1  # likewise of what is seen around the object in the scene "workspace"
 GROUPS = {"cloth": GRID_GROUPS, "rope": LINE_GROUPS}
 
 
@@ -89,7 +90,7 @@ def plan_batches(config: RenderConfig) -> dict[str, dict]:
         batch = max(1, IMAGES_A_BATCH // config.views)
         for start in range(0, len(views), batch):
             episodes = [[start + i, n] for i, n in enumerate(views[start : start + batch])]
-            job = {"config": dataclasses.asdict(config), "split": split, "episodes": episodes, "sheet": described}
+            job = {"config": to_dict(config), "split": split, "episodes": episodes, "sheet": described}
             jobs[f"{split}_{start:06d}"] = job
     return jobs
 
@@ -155,15 +156,18 @@ def _check_same_config(config: RenderConfig, stored: dict, folder: Path) -> None
 
 def _describe(config: RenderConfig) -> dict:
     """All that decides the images."""
-    return dataclasses.asdict(config) | {"scenes": _name_scenes(config)}
+    return to_dict(config) | {"scenes": _name_scenes(config)}
 
 
 def _name_scenes(config: RenderConfig) -> int | str:
-    """Version of the object's scenes; of an object of the user's own, with the digest of what its file describes."""
-    sheet = load_object(config)
+    """Version of the object's scenes; of an object of the user's own, with the digest of what its file describes.
+
+    Of another scene than the plain one, with its name and version.
+    """
+    sheet, around = load_object(config), "" if config.scene == "plain" else f"-{config.scene}{WORKSPACES}"
     if sheet is None:
-        return SCENES[config.object]
-    return f"{SCENES['cloth']}-{hashlib.sha256(json.dumps(sheet.to_dict()).encode()).hexdigest()[:8]}"
+        return f"{SCENES[config.object]}{around}" if around else SCENES[config.object]
+    return f"{SCENES['cloth']}{around}-{hashlib.sha256(json.dumps(sheet.to_dict()).encode()).hexdigest()[:8]}"
 
 
 def _describe_symmetry(config: RenderConfig) -> dict:
@@ -202,7 +206,7 @@ def _assemble(config: RenderConfig, partial: Path, names: list[str]) -> Path:
         "format": FORMAT,
         "object": config.object,
         "images": labels.split.value_counts().to_dict(),
-        "config": dataclasses.asdict(config),
+        "config": to_dict(config),
         "versions": {"scenes": _name_scenes(config), **_list_versions()},
         **_describe_symmetry(config),
     }

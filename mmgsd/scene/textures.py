@@ -78,9 +78,10 @@ class Shader:
         """Linear mix of two colours."""
         return self.node("MixRGB", {0: factor, 1: a, 2: b}).outputs[0]
 
-    def finish(self, colour: object, roughness: float, gloss: float, on_object: bool) -> None:
+    def finish(self, colour: object, roughness: float, gloss: float, on_object: bool, normal: object = None) -> None:
         """Close the tree with a rough surface under a share ``gloss`` of shine; the mask learns what is the object."""
-        surface = self.node("BsdfDiffuse", {"Color": colour, "Roughness": roughness}).outputs[0]
+        relief = {} if normal is None else {"Normal": normal}
+        surface = self.node("BsdfDiffuse", {"Color": colour, "Roughness": roughness, **relief}).outputs[0]
         if gloss:  # a full principled shader takes half as long again for each image
             shine = self.node("BsdfGlossy", {"Color": (1, 1, 1, 1), "Roughness": roughness}).outputs[0]
             surface = self.node("MixShader", {0: gloss, 1: surface, 2: shine}).outputs[0]
@@ -205,10 +206,10 @@ def _ground_clutter(rng: np.random.Generator, shader: Shader, colour: Colour, pl
 
 def draw_clutter(rng: np.random.Generator, colour: Colour) -> Image.Image:
     """Polygons, discs and lines of random colours on ``colour``: an image of 512 × 512 px."""
-    image = Image.new("RGB", (CLUTTER_PX, CLUTTER_PX), _as_bytes(colour))
+    image = Image.new("RGB", (CLUTTER_PX, CLUTTER_PX), as_bytes(colour))
     pen = ImageDraw.Draw(image)
     for _ in range(rng.integers(15, 90)):
-        centre, fill = rng.uniform(0, CLUTTER_PX, size=2), _as_bytes(draw_colour(rng))
+        centre, fill = rng.uniform(0, CLUTTER_PX, size=2), as_bytes(draw_colour(rng))
         reach = np.exp(rng.uniform(np.log(6), np.log(110)))
         corners = [tuple(point) for point in centre + rng.uniform(-reach, reach, size=(rng.integers(3, 7), 2))]
         shape = rng.choice(["polygon", "disc", "line"])
@@ -221,7 +222,8 @@ def draw_clutter(rng: np.random.Generator, colour: Colour) -> Image.Image:
     return image
 
 
-def _as_bytes(colour: Colour) -> tuple[int, int, int]:
+def as_bytes(colour: Colour) -> tuple[int, int, int]:
+    """sRGB, 0 to 255, of a linear colour."""
     return tuple(int(255 * c) for c in _display(colour))
 
 
