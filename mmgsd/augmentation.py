@@ -14,6 +14,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from mmgsd.compositing import composite, disturb
 from mmgsd.config import TrainConfig
 from mmgsd.dataset import Dataset
 from mmgsd.network import compute_input_size
@@ -171,27 +172,46 @@ def make_batch(
 ) -> Batch:
     """Augment the images ``indices`` (B,), labels with them, and move them to the device.
 
-    Half of them are mirrored where the object has a mirror image.
+    Half of them are mirrored where the object has a mirror image; with ``config.clutter`` they are also put together
+    anew (`mmgsd.compositing`).
     """
-    size = compute_input_size(images.size, config.input_px)
-    visible = images.visible[indices].copy()  # (B, P)
-    pixels, masks, points = [], [], []
-    for k, index in enumerate(indices):
-        warp, xy = UNCHANGED, images.xy[index]
-        if config.augment:
-            warp = sample_warp(images.size, rng, rotate=config.rotate, bend=config.bend)
-            if images.mirror is not None and rng.random() < 0.5:
-                warp = warp.mirrored(images.size[0])
-                xy, visible[k] = xy[images.mirror], visible[k][images.mirror]
-        image, mask = warp_images([images.images[index], images.masks[index]], warp, images.size, size)
-        pixels.append(jitter_colours(image, rng) if config.augment else image)
-        masks.append(mask > 127)
-        points.append(warp.move(xy))
-    xy = np.stack(points)
-    inside = np.all((xy > -0.5) & (xy < np.array(images.size) - 0.5), axis=-1)
-    if images.present is not None:  # an absent object has no matches
-        inside &= images.present[indices][:, None]
-    image = torch.from_numpy(np.stack(pixels)).to(device).permute(0, 3, 1, 2).float() / 255
-    tensors = (torch.from_numpy(a).to(device) for a in (np.stack(masks), xy.astype(np.float32)))
-    askable = torch.from_numpy(inside & visible).to(device)
-    return Batch(image, *tensors, askable, torch.from_numpy(inside).to(device))
+    made = [_make_one(images, int(index), config, rng) for index in indices]
+    image, mask, xy, visible, present = (np.stack(values) for values in zip(*made, strict=True))
+    inside = np.all((xy > -0.5) & (xy < np.array(images.size) - 0.5), axis=-1) & present[:, None]
+    image = torch.from_numpy(image).to(device).permute(0, 3, 1, 2).float() / 255
+    tensors = (torch.from_numpy(a).to(device) for a in (mask, xy.astype(np.float32), inside & visible, inside))
+    return Batch(image, *tensors)
+
+
+Labelled = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, bool]  # image, mask, xy, visible, present
+
+
+def _make_one(images: TrainingImages, index: int, config: TrainConfig, rng: np.random.Generator) -> Labelled:
+    """One augmented image (h, w, 3) uint8, its mask (h, w) bool, points (P, 2) px, which are visible, and presence."""
+    size, warp, xy = compute_input_size(images.size, config.input_px), UNCHANGED, images.xy[index]
+    visible, present = images.visible[index], images.present is None or bool(images.present[index])
+    if config.augment:
+        warp = sample_warp(images.size, rng, rotate=config.rotate, bend=config.bend)
+        if images.mirror is not None and rng.random() < 0.5:
+            warp = warp.mirrored(images.size[0])
+            xy, visible = xy[images.mirror], visible[images.mirror]
+    image, mask = warp_images([images.images[index], images.masks[index]], warp, images.size, size)
+    xy = warp.move(xy)
+    if config.clutter:
+        made = composite(image, mask, lambda: _borrow(images, rng), rng)
+        image, mask, present = made.image, made.mask, present and made.present
+        visible = visible & ~_look_up(made.covered, xy, images.size) & present
+    image = jitter_colours(image, rng) if config.augment else image
+    return disturb(image, rng) if config.clutter else image, mask > 127, xy, visible, present
+
+
+def _borrow(images: TrainingImages, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Another image with its mask."""
+    index = int(rng.integers(len(images.images)))
+    return images.images[index], images.masks[index]
+
+
+def _look_up(covered: np.ndarray, xy: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Which of the px (P, 2) of an image of ``size`` are covered in its copy (h, w) bool."""
+    columns, rows = np.rint(_scale(xy, size, covered.shape[::-1])).astype(int).T
+    return covered[rows.clip(0, covered.shape[0] - 1), columns.clip(0, covered.shape[1] - 1)]

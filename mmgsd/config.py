@@ -41,7 +41,8 @@ REFERENCE = {  # Dense Object Nets' training (Florence et al. 2018): 3,500 steps
 }  # fmt: skip
 OWN_STEPS = ("spcl_reference", *LONGER_TRAINED)  # models of the main table with another number of steps than the rest
 OPTIMISERS = ("adamw", "muon")
-ADDED = {"optimiser": "adamw", "roundness": 0.2, "scene": "plain"}  # later fields, and how it was done without them
+ADDED = {"optimiser": "adamw", "roundness": 0.2, "scene": "plain", "heads": False, "clutter": False,
+         "also": ""}  # later fields, and how it was done without them  # fmt: skip
 N_POINTS = 625  # material points of the cloth and the rope
 
 Config = TypeVar("Config", bound="RenderConfig | TrainConfig | EvaluateConfig")
@@ -159,6 +160,9 @@ class TrainConfig:
     bend: float = 0.0  # augmentation stretches and squeezes images along random waves, by up to this share
     rotate: bool = True  # augmentation turns images by any angle; off where the rotation limit is the experiment
     roundness: float = ROUNDNESS  # of the modes read from its heatmaps, a priori (`mmgsd.mixture.fit_modes`)
+    heads: bool = False  # it also learns where the object is, what is seen and whether it is there (`mmgsd.heads`)
+    clutter: bool = False  # augmentation changes backgrounds and puts things in front (`mmgsd.compositing`)
+    also: str = ""  # preset whose images of the object are trained on besides the data set's own, or ""
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -186,6 +190,9 @@ class TrainConfig:
         _check("bend", self.bend, "in [0, 0.5]", 0 <= self.bend <= 0.5)
         for name in ("weight_decay", "seed"):
             _check(name, getattr(self, name), "at least 0", getattr(self, name) >= 0)
+        _check("heads", self.heads, f"False for {self.network!r}", not self.heads or self.network in PASSES)
+        if self.also:
+            _check_choice("also", self.also, tuple(PRESETS))
 
     @property
     def dense_weight(self) -> float:

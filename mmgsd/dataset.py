@@ -89,7 +89,7 @@ class Dataset:
 
         Data that do not name the version of their scenes are from before these were counted: of the first.
         """
-        made = {key: self.info[key] for key in ("config", "versions", "packed") if key in self.info}
+        made = {key: self.info[key] for key in ("config", "versions", "packed", "joined") if key in self.info}
         if "versions" in made:
             made["versions"] = {"scenes": 1, **made["versions"]}
         text = json.dumps(list(made.values()), sort_keys=True)
@@ -169,6 +169,27 @@ def hold_out(data: Dataset, *, share: float = 0.05) -> tuple[Dataset, Dataset]:
         return data, data
     parts = (data.labels[~held], data.labels[held])
     return tuple(dataclasses.replace(data, labels=part.reset_index(drop=True)) for part in parts)
+
+
+def join_datasets(first: Dataset, *others: Dataset) -> Dataset:
+    """The images of one split of several data sets as one data set, whose description is the first's.
+
+    ValueError where they are not of one object, with images of one size and the same material points.
+    """
+    if not others:
+        return first
+    for other in others:
+        theirs, ours = ((data.object, data.size, data.n_points) for data in (other, first))
+        if theirs != ours:
+            raise ValueError(f"data sets that are joined must be alike (object, size, material points): {first.folder} "
+                             f"has {ours}, {other.folder} {theirs}")  # fmt: skip
+    tables = []
+    for data in (first, *others):
+        places = {name: [str(data.folder.absolute() / file) for file in data.labels[name]] for name in ("file", "mask")}
+        last = max((table.episode.max() for table in tables), default=-1)
+        tables.append(data.labels.assign(**places, episode=data.episode + last + 1, present=data.present))
+    info = first.info | {"joined": [other.fingerprint for other in others]}
+    return dataclasses.replace(first, info=info, labels=pd.concat(tables, ignore_index=True))
 
 
 def measure_images(data: Dataset) -> pd.DataFrame:

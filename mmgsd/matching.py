@@ -147,7 +147,9 @@ class Matcher:
         if metadata.get("format") != "mmgsd-1":
             raise ValueError(f"{path} holds no mmgsd weights: its metadata says format {metadata.get('format')!r}")
         config = from_dict(TrainConfig, json.loads(metadata["config"]))
-        network = build_network(config.network, config.descriptor_dim, roles=config.roles, pretrained=False)
+        network = build_network(
+            config.network, config.descriptor_dim, roles=config.roles, heads=config.heads, pretrained=False
+        )
         try:
             network.load_state_dict({name: value.float() for name, value in state.items()})
         except RuntimeError as error:

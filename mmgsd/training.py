@@ -26,7 +26,7 @@ from tqdm.auto import tqdm
 from mmgsd import distributed, losses
 from mmgsd.augmentation import Batch, load_training_images, make_batch
 from mmgsd.config import CONTRASTIVE, DETAILED, MATCHES_OF_ONE, PASSES, TrainConfig, from_dict
-from mmgsd.dataset import Dataset, hold_out, load_dataset
+from mmgsd.dataset import Dataset, hold_out, join_datasets, load_dataset
 from mmgsd.evaluation import calibrate_bandwidth, calibrate_temperature, measure_rmse
 from mmgsd.matching import Matcher, load
 from mmgsd.network import (
@@ -36,6 +36,7 @@ from mmgsd.network import (
     sample_descriptors,
 )
 from mmgsd.optimiser import make_optimisers
+from mmgsd.objective import compute_head_loss
 from mmgsd.prototypes import compute_prototype_loss, make_prototypes
 
 WEIGHTS, CHECKPOINT, LOG = "weights.safetensors", "checkpoint.safetensors", "log.csv"
@@ -77,12 +78,12 @@ def train_model(
     """
     weights = folder / WEIGHTS
     if weights.is_file() and not overwrite:
-        if load_metadata(weights).get("data") != load_dataset(dataset, "test").fingerprint:
+        if load_metadata(weights).get("data") != join_datasets(*_load_data(config, dataset, "test")).fingerprint:
             raise ValueError(f"{weights} was trained on another data set than {dataset}: use overwrite=True")
         return weights
-    data = load_dataset(dataset, "train")
-    if data.object != config.object:
-        raise ValueError(f"object is {config.object!r}, but {dataset} shows a {data.object}")
+    data = _load_data(config, dataset, "train")
+    if data[0].object != config.object:
+        raise ValueError(f"object is {config.object!r}, but {dataset} shows a {data[0].object}")
     with distributed.joined(config.groups, device or find_device()) as team, _repeatable(team.device):
         run = _Run(config, data, folder, team, validate_every)  # what is wrong is said before anything is deleted
         if overwrite and team.rank == 0 and folder.exists():
@@ -136,10 +137,12 @@ class _Run:
     """A training run that can be killed between any two steps."""
 
     def __init__(
-        self, config: TrainConfig, data: Dataset, folder: Path, team: distributed.Team, validate_every: int = 0
+        self, config: TrainConfig, parts: list[Dataset], folder: Path, team: distributed.Team, validate_every: int = 0
     ) -> None:
         self.config, self.folder, self.team, self.validate_every = config, folder, team, validate_every
-        self.data, self.held_out = hold_out(data)  # the latter for calibration
+        # the latter for calibration
+        self.data, self.held_out = (join_datasets(*split) for split in zip(*map(hold_out, parts), strict=True))
+        data = self.data
         self.device, self.size = team.device, data.size
         device = team.device
         group = data.group(config.group)
@@ -183,10 +186,13 @@ class _Run:
         chosen = np.random.default_rng([seed, step]).choice(count, self.config.batch, count < self.config.batch)
         own = np.array_split(chosen, groups)[group]
         batch = make_batch(self.images, own, self.config, np.random.default_rng([seed, step, group]), self.device)
-        descriptors = self.network(batch.image.contiguous(memory_format=torch.channels_last))
-        loss = compute_loss(self.config, descriptors, batch, self.permutations, self.size, step, group)
+        said = self.network.describe(batch.image.contiguous(memory_format=torch.channels_last))
+        loss = compute_loss(self.config, said.descriptors, batch, self.permutations, self.size, step, group)
         if self.config.dense_weight:
-            loss = loss + self.config.dense_weight * self.compute_dense_loss(descriptors, batch)
+            loss = loss + self.config.dense_weight * self.compute_dense_loss(said.descriptors, batch)
+        if self.config.heads:
+            seeds = torch.Generator(self.device).manual_seed(-1 - (seed * 1_000_003 + step) * groups - group)
+            loss = loss + compute_head_loss(self.network.heads, said, batch, self.permutations, self.size, seeds)
         (loss / groups).backward()
         return loss.item() / groups
 
@@ -291,6 +297,12 @@ class _Run:
         return weights
 
 
+def _load_data(config: TrainConfig, dataset: Path, split: str) -> list[Dataset]:
+    """The data set, and that of the preset ``config.also``, which lies beside it, where one is named."""
+    folders = [dataset, *([dataset.parents[1] / config.also / dataset.name] if config.also else [])]
+    return [load_dataset(folder, split) for folder in folders]
+
+
 def load_metadata(weights: Path | str) -> dict[str, str]:
     """What a weights file says of itself: ``config``, ``seconds`` of training, ``hardware``, ``images``, …"""
     with safe_open(weights, "pt") as file:
@@ -322,7 +334,8 @@ def _make_network(config: TrainConfig, models: Path) -> torch.nn.Module:
     """The network as training starts from it; ``models`` is the folder of the models trained beside it."""
     start, beside = config.trunk_weights, models / config.trunk_weights / WEIGHTS
     start = str(beside) if start and beside.is_file() else start
-    network = build_network(config.network, config.descriptor_dim, roles=config.roles, trunk_weights=start)
+    parts = {"roles": config.roles, "heads": config.heads, "trunk_weights": start}
+    network = build_network(config.network, config.descriptor_dim, **parts)
     if start and config.network in PASSES:  # of a model of ours; resnet34 has read torchvision's
         trained = load(start, device="cpu")
         for name in ("network", "descriptor_dim", "roles"):
