@@ -90,10 +90,10 @@ def disturb(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 def fill_object(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """The image (h, w, 3) uint8 without its object: blurred surroundings in its place."""
-    away = (mask < 64).astype(np.float32)
+    away = cv2.erode((mask < 64).astype(np.float32), np.ones((5, 5)))
     small = max(1, min(mask.shape) // 32)
     size = (mask.shape[1] // small, mask.shape[0] // small)
-    weight = cv2.resize(cv2.erode(away, np.ones((5, 5))), size, interpolation=cv2.INTER_AREA) + 1e-4
+    weight = cv2.resize(away, size, interpolation=cv2.INTER_AREA) + 1e-4
     colours = cv2.resize(image * away[..., None], size, interpolation=cv2.INTER_AREA)
     reach = (0, 0), max(size) / 8
     filled = cv2.GaussianBlur(colours, *reach) / cv2.GaussianBlur(weight, *reach)[..., None]
@@ -131,10 +131,7 @@ def _colour_in(shape: tuple[int, int], rng: np.random.Generator, *, black_or_whi
         return np.full((*shape, 3), 255 * int(rng.random() < 0.4), np.uint8)
     if kind < black_or_white + FLAT:
         return np.broadcast_to(colour.astype(np.uint8), (*shape, 3)).copy()
-    if kind < black_or_white + FLAT + NATURAL:
-        levels = _draw_noise(shape, rng)
-    else:
-        levels = _draw_pattern(shape, rng)
+    levels = (_draw_noise if kind < black_or_white + FLAT + NATURAL else _draw_pattern)(shape, rng)
     other = colour + rng.uniform(-1, 1, 3) * rng.choice([15, 50, 160])
     ramp = colour + np.linspace(0, 1, 256)[:, None] * (other - colour)  # (256, 3)
     return cv2.applyColorMap(levels, ramp.clip(0, 255).astype(np.uint8)[:, None])

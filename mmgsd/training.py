@@ -35,8 +35,8 @@ from mmgsd.network import (
     find_device,
     sample_descriptors,
 )
-from mmgsd.optimiser import make_optimisers
 from mmgsd.objective import compute_head_loss
+from mmgsd.optimiser import make_optimisers
 from mmgsd.prototypes import compute_prototype_loss, make_prototypes
 
 WEIGHTS, CHECKPOINT, LOG = "weights.safetensors", "checkpoint.safetensors", "log.csv"

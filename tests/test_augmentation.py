@@ -181,3 +181,16 @@ def test_without_a_mirror_nothing_is_mirrored(tiny_dataset: Callable[..., Path],
         xy = make_batch(images, np.array([0]), CONFIG, rng, torch.device("cpu")).xy[0].numpy()
         (ax, ay), (bx, by) = xy[24] - xy[0], xy[600] - xy[0]
         assert ax * by - ay * bx > 0
+
+
+def test_clutter_hides_points_and_takes_objects_away(tiny_dataset: Callable[..., Path]) -> None:
+    images = load_training_images(load_dataset(tiny_dataset(), "train"), 128)
+    config = dataclasses.replace(CONFIG, clutter=True)
+    rng = np.random.default_rng(0)
+    made = [make_batch(images, np.arange(4), config, rng, torch.device("cpu")) for _ in range(30)]
+    masks, inside, askable = (torch.cat([getattr(batch, name) for batch in made])
+                              for name in ("mask", "inside", "askable"))  # fmt: skip
+    absent = ~inside.any(1)
+    assert 0 < absent.float().mean() < 0.2
+    assert not masks[absent].any() and not askable[absent].any()
+    assert (askable.sum(1) < inside.sum(1)).any()  # something lies in front

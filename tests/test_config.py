@@ -28,8 +28,9 @@ from mmgsd.config import (
 OTHER = {  # another accepted value for the fields that are no plain numbers or flags
     "object": "cloth", "method": "pcl", "group": "identity", "network": "lite0", "trunk_weights": "w.safetensors",
     "schedule": "step", "optimiser": "muon", "rotation_deg": 45.0, "bend": 0.25, "groups": 2, "roles": 2,
+    "scene": "workspace", "also": "workspace",
 }  # fmt: skip
-CONFIGS = (RenderConfig(object="rope"), TrainConfig(object="rope", network="resnet34"), EvaluateConfig(points=600))
+CONFIGS = (RenderConfig(object="rope"), TrainConfig(object="rope", network="lite0x2"), EvaluateConfig(points=600))
 FIELDS = [(config, field.name) for config in CONFIGS for field in dataclasses.fields(config)]
 
 

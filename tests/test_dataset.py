@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from mmgsd.dataset import (
     encode_image,
     encode_mask,
     hold_out,
+    join_datasets,
     load_dataset,
     measure_images,
     sample_pairs,
@@ -228,3 +230,22 @@ def test_last_simulations_are_held_out(tiny_dataset: Callable[..., Path]) -> Non
 def test_one_simulation_cannot_be_held_out(tiny_dataset: Callable[..., Path]) -> None:
     data = load_dataset(tiny_dataset(n_train=2))
     assert [len(part) for part in hold_out(data)] == [2, 2]
+
+
+def test_joined_data_sets_keep_images_and_simulations_apart(tiny_dataset: Callable[..., Path], tmp_path: Path) -> None:
+    folder = tiny_dataset()
+    other = shutil.copytree(folder, tmp_path / "other")
+    edit_labels(other, lambda labels: labels.iloc[::-1])
+    first, second = (load_dataset(place, "train") for place in (folder, other))
+    joined = join_datasets(first, second)
+    assert len(joined) == len(first) + len(second)
+    assert len(np.unique(joined.episode)) == len(np.unique(first.episode)) + len(np.unique(second.episode))
+    assert (joined.load_image(len(first)) == second.load_image(0)).all()
+    assert joined.fingerprint != first.fingerprint
+    assert join_datasets(first).fingerprint == first.fingerprint
+
+
+def test_data_sets_of_different_objects_are_not_joined(tiny_dataset: Callable[..., Path]) -> None:
+    cloth, rope = (load_dataset(tiny_dataset(object=name), "train") for name in ("cloth", "rope"))
+    with pytest.raises(ValueError, match="must be alike .*cloth.*rope"):
+        join_datasets(cloth, rope)
