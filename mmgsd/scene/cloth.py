@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -40,9 +41,10 @@ def build_cloth(rng: np.random.Generator, config: RenderConfig) -> DeformedObjec
 
     The 625 points are (25, 25) row-major vertices of the rendered surface itself; 1 m a side.
     """
+    sheet = draw_rectangle(rng) if config.scene == "workspace" else square_sheet()
     state = str(rng.choice(list(STATES), p=list(STATES.values())))
-    vertices, frames = deform(rng, state)
-    return hand_over(vertices, {"state": state, "physics_frames": frames})
+    vertices, frames = deform(rng, state, sheet)
+    return hand_over(vertices, {"state": state, "physics_frames": frames}, sheet)
 
 
 def build_sheet(rng: np.random.Generator, sheet: Sheet) -> DeformedObject:
@@ -54,9 +56,11 @@ def build_sheet(rng: np.random.Generator, sheet: Sheet) -> DeformedObject:
     return DeformedObject(mesh, points, VISIBILITY_RADIUS, {"state": state, "physics_frames": frames})
 
 
-def hand_over(vertices: np.ndarray, info: dict[str, str | float | int]) -> DeformedObject:
-    """Add simulated vertices (1369, 3) m to the scene as a smooth cloth lying on the floor."""
-    mesh = _add_rendered(vertices, square_sheet())
+def hand_over(
+    vertices: np.ndarray, info: dict[str, str | float | int], sheet: Sheet | None = None
+) -> DeformedObject:
+    """Add simulated vertices (1369, 3) m of the square or a rectangle to the scene as a smooth cloth on the floor."""
+    mesh = _add_rendered(vertices, sheet or square_sheet())
     grid = read_vertices(mesh.data)[_order_row_major(mesh.data)]  # (73, 73, 3)
     return DeformedObject(mesh, grid[::3, ::3].reshape(-1, 3), VISIBILITY_RADIUS, info)
 
@@ -121,6 +125,13 @@ def flat_vertices() -> np.ndarray:
 def square_sheet() -> Sheet:
     """The simulated square cloth."""
     return Sheet("cloth", flat_vertices(), grid_faces(SIDE), grid_group("c4", side=SIDE))
+
+
+def draw_rectangle(rng: np.random.Generator) -> Sheet:
+    """The square cloth, or one that is a little or much longer than wide: its points are those of the square."""
+    square = square_sheet()
+    width = rng.choice([1.0, rng.uniform(0.93, 1.0), rng.uniform(0.55, 0.9)], p=[0.6, 0.25, 0.15])
+    return dataclasses.replace(square, rest=square.rest * (width, 1.0, 1.0))
 
 
 def _rippled(rng: np.random.Generator, sheet: Sheet, height: float) -> np.ndarray:
@@ -309,9 +320,12 @@ def grid_faces(side: int) -> np.ndarray:
 def _add_rendered(vertices: np.ndarray, sheet: Sheet) -> bpy.types.Object:
     """A smooth static mesh lying on z = 0: of the square cloth's, 73 × 73 vertices."""
     coarse = add_mesh("cloth coarse", vertices, sheet.faces)
-    if sheet is square_sheet():  # textures in its own coordinates; they have a square's symmetry
+    if sheet.name == "cloth":  # textures in its own coordinates; they have a square's symmetry
         rest = coarse.data.attributes.new("rest", "FLOAT_VECTOR", "POINT")
-        rest.data.foreach_set("vector", (sheet.rest / EXTENT).astype(np.float32).ravel())
+        rest.data.foreach_set("vector", (flat_vertices() / EXTENT).astype(np.float32).ravel())
+    face = coarse.data.attributes.new("face", "FLOAT_VECTOR", "POINT")  # for pictures: 0 to 1 over the sheet
+    low, high = sheet.rest.min(axis=0), sheet.rest.max(axis=0)
+    face.data.foreach_set("vector", ((sheet.rest - low) / np.maximum(high - low, 1e-9)).astype(np.float32).ravel())
     subdivision = coarse.modifiers.new("subdivision", "SUBSURF")
     subdivision.levels = 1
     mesh = bpy.data.meshes.new_from_object(coarse.evaluated_get(bpy.context.evaluated_depsgraph_get()))

@@ -55,7 +55,7 @@ class Shader:
 
     def __init__(self, material: bpy.types.Material) -> None:
         material.use_nodes = True
-        self.tree = material.node_tree
+        self.material, self.tree = material, material.node_tree
         self.tree.nodes.clear()
 
     def node(self, kind: str, inputs: dict | None = None, **properties: object) -> bpy.types.Node:
