@@ -6,7 +6,6 @@ bpy is imported in these children only (``python -m mmgsd.scene``): a crash, a l
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import hashlib
 import importlib.metadata
 import io

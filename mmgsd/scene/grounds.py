@@ -8,7 +8,7 @@ import bpy
 import numpy as np
 
 from mmgsd.scene.materials import PREFIX, paint_plain, paint_surface
-from mmgsd.scene.prints import Bytes, draw_other, draw_paint, vary_paint
+from mmgsd.scene.prints import Bytes, draw_other, draw_paint, draw_table, vary_paint
 from mmgsd.scene.render import add_mesh
 from mmgsd.scene.solids import Solid, make_box, make_walls, merge, move
 
@@ -78,7 +78,7 @@ def draw_ground(rng: np.random.Generator, site: Site) -> tuple[str, list[Solid],
         _add_floor(main, -thick - 12 * STEP)
     else:
         deep = 0.75 if kind == "table" else thick + 12 * STEP
-        _add_floor(paint_surface(rng, draw_paint(rng), sheet=False)[0], -deep)
+        _add_floor(paint_surface(rng, draw_table(rng), sheet=False)[0], -deep)
         outline = _add_top(rng, site, kind, thick, main)
         walls = _add_walls(rng, outline) if kind == "tray" else []
     for level in range(int(rng.choice([0, 1, 2, 3], p=[0.35, 0.3, 0.2, 0.15]))):
@@ -90,7 +90,7 @@ def draw_ground(rng: np.random.Generator, site: Site) -> tuple[str, list[Solid],
 
 def draw_like(rng: np.random.Generator, colour: Bytes, share: float) -> Bytes:
     """A colour like the object's in a ``share`` of the draws, else one unlike it."""
-    return vary_paint(rng, colour, 0.06) if rng.random() < share else draw_other(rng, colour, distance=70)
+    return vary_paint(rng, colour, 0.06) if rng.random() < share else draw_other(rng, colour, distance=70, draw=draw_table)
 
 
 def _draw_mask(rng: np.random.Generator, colour: Bytes) -> Bytes:

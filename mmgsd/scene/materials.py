@@ -10,7 +10,7 @@ from mmgsd.scene.prints import Bytes, draw_other, draw_paint, to_linear
 from mmgsd.scene.textures import BACKGROUNDS, Shader
 
 PREFIX = "view "  # of the names of what belongs to one view
-PROCEDURAL = tuple(name for name in BACKGROUNDS if name not in ("clutter", "plain"))
+PROCEDURAL = {"wood": 0.4, "noise": 0.25, "tiles": 0.15, "checker": 0.08, "terrazzo": 0.12}
 
 
 def remove_view() -> None:
@@ -49,7 +49,7 @@ def paint_surface(rng: np.random.Generator, colour: Bytes, *, sheet: bool) -> tu
         scale = 1.0 if sheet else np.exp(rng.uniform(np.log(0.25), np.log(2.0)))
         surface = add_picture(shader, pixels, _map(rng, shader, place, scale, turned=not sheet))
     else:
-        name = "plain" if kind == "plain" else str(rng.choice(PROCEDURAL))
+        name = "plain" if kind == "plain" else str(rng.choice(list(PROCEDURAL), p=list(PROCEDURAL.values())))
         place = _map(rng, shader, shader.node("TexCoord").outputs["Object"], 1.0, turned=True)
         surface = BACKGROUNDS[name](rng, shader, to_linear(colour), place)
     shader.finish(surface, rng.uniform(0.4, 1.0), rng.uniform(0.01, 0.08) if rng.random() < 0.3 else 0.0, False)

@@ -1,10 +1,10 @@
 """Views of an object in a robotics lab's workspace: what `mmgsd.scene.episode` renders where the scene is "workspace".
 
-Tables, boards, mats, trays and paper under the object and beside it, things around it and on it, an oblique near camera,
-hard or coloured light, prints and stickers on the object; in a few views the object is not there. Sensor effects
-(blur, noise, compression) are none of the scene's: training adds them.
+Tables, boards, mats, trays and paper under the object and beside it, things around it and on it, an oblique near
+camera, hard or coloured light, prints and stickers on the object; in a few views the object is not there. Sensor
+effects (blur, noise, compression) are none of the scene's: training adds them.
 
-The labels gain ``present``, ``ground``, ``things`` and ``tilt_deg``; a point that a thing covers is not visible.
+The labels gain ``present``, ``things``, ``light`` and ``tilt_deg``; a point that a thing covers is not visible.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from mmgsd.scene.things import add_things
 ABSENT = 0.03  # share of the views without the object
 MAX_TILT_DEG = 50.0
 MAX_OUTSIDE = 0.05  # share of the material points that may fall out of the picture
-LEAST_PX = 2.0  # of a rope's diameter
+LEAST_PX = 4.0  # of a rope's diameter
 TRIES = 60  # to frame the object, before the camera looks straight down
 EXTENTS = {"cloth": 1.0}  # m of a side at rest; of other objects what they span
 
@@ -44,12 +44,12 @@ def render_view(
     present = rng.random() >= ABSENT
     visible = render.find_visible(deformed, bvh, camera)
     visible, things = add_things(rng, site, camera, visible, beside=masked is None, walls=walls)
-    draw_light(rng, scene, site.side, np.append(site.middle, 0.0))
+    light = draw_light(rng, scene, site.side, np.append(site.middle, 0.0))
     deformed.mesh.hide_render = not present
     image, mask = render.render_image(scene, seed=int(rng.integers(2**31)))
     if masked is not None:
         image[~mask] = masked
-    labels = {"turn_deg": np.degrees(turn), "tilt_deg": tilt, "texture": texture, "background": ground}
+    labels = {"turn_deg": np.degrees(turn), "tilt_deg": tilt, "texture": texture, "background": ground, "light": light}
     return View(
         image=image,
         mask=mask,
@@ -112,7 +112,8 @@ def _frame(
     nearness: float,
 ) -> Camera:  # fmt: skip
     """Points (N, 3) m seen from ``nearness`` times their extent, tilted (degrees), filling a share of the picture."""
-    rotation = np.array(Euler((0.0, 0.0, turn)).to_matrix()) @ np.array(Euler((np.pi + np.radians(tilt), 0, 0)).to_matrix())
+    down = np.array(Euler((np.pi + np.radians(tilt), 0.0, 0.0)).to_matrix())
+    rotation = np.array(Euler((0.0, 0.0, turn)).to_matrix()) @ down
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     distance = max(0.5, nearness * np.ptp(points[:, :2], axis=0).max())
     local = (points - middle) @ rotation + (0, 0, distance)
@@ -145,12 +146,12 @@ LIGHTS = {
     "sun": _Lighting((0.7, 1.5), (0.12, 0.4), (0.4, 3.0), 0.25),
     "lamp": _Lighting((0.6, 1.5), (0.1, 0.5), (0.03, 0.5), 0.27),
     "glare": _Lighting((1.6, 3.0), (0.2, 0.6), (0.4, 10.0), 0.08),
-    "dim": _Lighting((0.12, 0.4), (0.3, 0.9), (0.1, 0.6), 0.1),
+    "dim": _Lighting((0.2, 0.5), (0.3, 0.9), (0.1, 0.6), 0.1),
 }
 
 
 def draw_light(rng: np.random.Generator, scene: bpy.types.Scene, side: float, target: np.ndarray) -> str:
-    """Light the object at ``target`` (3,) m with a sun or a lamp near by, warm, cold or of a colour; the light's name."""
+    """Light the object at ``target`` (3,) m with a sun or a lamp near by, warm, cold or coloured; the light's name."""
     name = str(rng.choice(list(LIGHTS), p=[light.share for light in LIGHTS.values()]))
     light = LIGHTS[name]
     exposure, ambient = np.exp(rng.uniform(*np.log(light.exposure))), rng.uniform(*light.ambient)
