@@ -43,7 +43,8 @@ class Site:
 
     def draw_turn(self, rng: np.random.Generator) -> float:
         """An angle (rad): the object's own, the picture's, or any."""
-        return float(rng.choice([0.0, -self.turn, rng.uniform(0, 2 * np.pi)], p=[0.25, 0.4, 0.35]) + rng.normal() * 0.03)
+        turn = rng.choice([0.0, self.turn, rng.uniform(0, 2 * np.pi)], p=[0.25, 0.4, 0.35])
+        return float(turn + rng.normal() * 0.03)
 
 
 def add_solid(solid: Solid, material: bpy.types.Material, name: str = "thing") -> Solid:
@@ -65,7 +66,7 @@ def add_plate(centre: np.ndarray, size: np.ndarray, turn: float, top: float, thi
 
 
 def draw_ground(rng: np.random.Generator, site: Site) -> tuple[str, list[Solid], Bytes | None]:
-    """Add what lies under the object; its kind, the solids that may hide the object, and the mask's colour if masked."""
+    """Add what lies under the object; its kind, solids that may hide the object, and the mask's colour if masked."""
     kind = str(rng.choice(list(KINDS), p=list(KINDS.values())))
     if kind == "masked":
         colour = _draw_mask(rng, site.colour)
@@ -90,7 +91,9 @@ def draw_ground(rng: np.random.Generator, site: Site) -> tuple[str, list[Solid],
 
 def draw_like(rng: np.random.Generator, colour: Bytes, share: float) -> Bytes:
     """A colour like the object's in a ``share`` of the draws, else one unlike it."""
-    return vary_paint(rng, colour, 0.06) if rng.random() < share else draw_other(rng, colour, distance=70, draw=draw_table)
+    if rng.random() < share:
+        return vary_paint(rng, colour, 0.06)
+    return draw_other(rng, colour, distance=70, draw=draw_table)
 
 
 def _draw_mask(rng: np.random.Generator, colour: Bytes) -> Bytes:

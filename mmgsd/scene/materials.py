@@ -52,15 +52,20 @@ def paint_surface(rng: np.random.Generator, colour: Bytes, *, sheet: bool) -> tu
         name = "plain" if kind == "plain" else str(rng.choice(list(PROCEDURAL), p=list(PROCEDURAL.values())))
         place = _map(rng, shader, shader.node("TexCoord").outputs["Object"], 1.0, turned=True)
         surface = BACKGROUNDS[name](rng, shader, to_linear(colour), place)
-    shader.finish(surface, rng.uniform(0.4, 1.0), rng.uniform(0.01, 0.08) if rng.random() < 0.3 else 0.0, False)
+    shader.finish(surface, rng.uniform(0.4, 1.0), _draw_gloss(rng, 0.3), False)
     return shader.material, name
 
 
 def paint_plain(rng: np.random.Generator, colour: Bytes) -> bpy.types.Material:
     """A material of one colour, shining on some things."""
     shader = new_shader()
-    shader.finish(to_linear(colour), rng.uniform(0.2, 1.0), rng.uniform(0.02, 0.12) if rng.random() < 0.4 else 0.0, False)
+    shader.finish(to_linear(colour), rng.uniform(0.2, 1.0), _draw_gloss(rng, 0.4), False)
     return shader.material
+
+
+def _draw_gloss(rng: np.random.Generator, chance: float) -> float:
+    """No shine, or with ``chance`` a little."""
+    return float(rng.uniform(0.01, 0.1)) if rng.random() < chance else 0.0
 
 
 def _map(rng: np.random.Generator, shader: Shader, place: object, scale: float, *, turned: bool) -> object:
@@ -93,7 +98,7 @@ def paint_object(rng: np.random.Generator, mesh: bpy.types.Object) -> tuple[Byte
         if i == 0:
             mean = tuple(int(c) for c in pixels.mean(axis=(0, 1)))
         names.append(name)
-        shader.finish(surface, rng.uniform(0.4, 1.0), rng.uniform(0.01, 0.06) if rng.random() < 0.25 else 0.0, True, normal)
+        shader.finish(surface, rng.uniform(0.4, 1.0), _draw_gloss(rng, 0.25), True, normal)
     return mean, names[0]
 
 

@@ -259,7 +259,8 @@ def _draw_motif(rng: np.random.Generator, pen: ImageDraw.ImageDraw, centre: np.n
     elif kind == "ring":
         pen.ellipse(box, outline=colour, width=max(1, int(reach / 3)))
     elif kind == "polygon":
-        pen.regular_polygon((x, y, max(1.0, reach)), int(rng.integers(3, 8)), rotation=int(rng.integers(360)), fill=colour)
+        circle, turn = (x, y, max(1.0, reach)), int(rng.integers(360))
+        pen.regular_polygon(circle, int(rng.integers(3, 8)), rotation=turn, fill=colour)
     elif kind == "cross":
         pen.rectangle([x - reach, y - reach / 3, x + reach, y + reach / 3], fill=colour)
         pen.rectangle([x - reach / 3, y - reach, x + reach / 3, y + reach], fill=colour)

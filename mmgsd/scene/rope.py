@@ -179,7 +179,9 @@ def _bindings(path: np.ndarray, up: np.ndarray, arc: np.ndarray, length: float, 
     return parts
 
 
-def _plugs(path: np.ndarray, side: np.ndarray, up: np.ndarray, arc: np.ndarray, lay: Lay, thickness: float) -> list[Part]:
+def _plugs(
+    path: np.ndarray, side: np.ndarray, up: np.ndarray, arc: np.ndarray, lay: Lay, thickness: float
+) -> list[Part]:
     """A connector over each end that has one, from the tip inwards; its lower half may sink into the table."""
     parts = []
     for to_end, length in zip((arc, arc[-1] - arc), lay.plugs, strict=True):
@@ -199,11 +201,12 @@ def _yarns(path: np.ndarray, side: np.ndarray, up: np.ndarray, lay: Lay, thickne
         out = (path[end] - path[inner]) / np.linalg.norm(path[end] - path[inner])
         steps = np.linspace(-0.3, lay.frayed, 6)[:, None] * thickness
         for k in range(11):
-            fan = 0.9 * np.sin(2.4 * k + lay.phase)  # evenly spread, and the same in every process
-            spread = np.maximum(steps, 0) ** 2 / (lay.frayed * thickness)
-            yarn = path[end] + steps * out + (fan * side[end] + 0.35 * np.cos(1.7 * k) * up[end]) * (0.3 * thickness + spread)
+            aside = 0.9 * np.sin(2.4 * k + lay.phase) * side[end] + 0.35 * np.cos(1.7 * k) * up[end]
+            spread = 0.3 * thickness + np.maximum(steps, 0) ** 2 / (lay.frayed * thickness)
+            yarn = path[end] + steps * out + spread * aside
             yarn[:, 2] = np.maximum(yarn[:, 2], 0.07 * thickness)
-            parts.append(Part(_sweep(yarn, np.broadcast_to(up[end], yarn.shape), np.full(6, 0.07 * thickness), 1.0, 4), MAIN))
+            towards = np.broadcast_to(up[end], yarn.shape)
+            parts.append(Part(_sweep(yarn, towards, np.full(6, 0.07 * thickness), 1.0, 4), MAIN))
     return parts
 
 

@@ -71,7 +71,8 @@ def _make_pen(rng: np.random.Generator) -> list[Part]:
 
 def _make_cord(rng: np.random.Generator) -> list[Part]:
     """A cable that winds for a metre or two; it has no ends of note, other ropes than the object must not look so."""
-    radius, knots = rng.uniform(0.002, 0.007), np.cumsum(rng.normal(scale=0.22, size=(7, 2)) + rng.normal(size=2) * 0.1, 0)
+    radius, drift = rng.uniform(0.002, 0.007), rng.normal(scale=0.1, size=2)
+    knots = np.cumsum(rng.normal(scale=0.22, size=(7, 2)) + drift, axis=0)
     path = CubicSpline(np.arange(7), knots - knots[3])(np.linspace(0, 6, 90))
     return [(make_tube(np.column_stack([path, np.full(90, radius)]), radius, sides=7), draw_paint(rng), False)]
 
@@ -94,9 +95,10 @@ def _make_gripper(rng: np.random.Generator) -> list[Part]:
     thick, wide, dark = rng.uniform(0.008, 0.02), rng.uniform(0.015, 0.03), draw_paint(rng)
     fingers = [make_box((thick, wide, length), (s * (gap + thick) / 2, 0, length / 2)) for s in (-1, 1)]
     palm = make_box((0.09 + gap, wide * 2.2, 0.06), (0, 0, length + 0.03))
-    arm = make_tube([(0, 0, length + z) for z in (0.05, 0.2, 0.25, 0.6, 1.2)], [0.035, 0.035, 0.05, 0.05, 0.05], sides=18)
-    body = draw_paint(rng)
-    return [*((finger, dark, False) for finger in fingers), (palm, body, False), (arm, vary_paint(rng, body, 0.2), False)]
+    heights = [(0, 0, length + z) for z in (0.05, 0.2, 0.25, 0.6, 1.2)]
+    arm, body = make_tube(heights, [0.035, 0.035, 0.05, 0.05, 0.05], sides=18), draw_paint(rng)
+    parts = [(finger, dark, False) for finger in fingers]
+    return [*parts, (palm, body, False), (arm, vary_paint(rng, body, 0.2), False)]
 
 
 def _make_tool(rng: np.random.Generator) -> list[Part]:
@@ -119,7 +121,8 @@ def _make_hand(rng: np.random.Generator) -> list[Part]:
     for k, length in enumerate((0.062, 0.078, 0.084, 0.075)):
         root, spread = (0.0, (k - 1.5) * 0.021, 0.09), rng.normal(scale=0.006)
         bent = (0.02 + rng.uniform(0, 0.03), root[1] + spread, 0.09 - 0.5 * length)
-        solids += [make_capsule(root, bent, 0.0095), make_capsule(bent, (0.0, bent[1] + spread, 0.09 - length), 0.009, 0.007)]
+        tip = (0.0, bent[1] + spread, 0.09 - length)
+        solids += [make_capsule(root, bent, 0.0095), make_capsule(bent, tip, 0.009, 0.007)]
     solids.append(make_capsule((0.0, 0.035, 0.14), (-0.005, 0.075, 0.08), 0.013, 0.009))  # thumb
     back = make_tube([(0.008, 0, z) for z in (0.08, 0.1, 0.14, 0.17, 0.2)], [0.03, 0.042, 0.044, 0.036, 0.03], sides=16)
     back = Solid(back.vertices * (0.45, 1, 1), back.faces, True)
@@ -137,7 +140,7 @@ BESIDE: dict[str, Maker] = {
     "weight": _make_weight, "textile": _make_textile, "cord": _make_cord,
 }  # fmt: skip
 OVER: dict[str, Maker] = {"gripper": _make_gripper, "tool": _make_tool, "hand": _make_hand}
-UPON: dict[str, Maker] = {"pen": _make_pen, "weight": _make_weight, "disc": _make_disc, "box": _make_box, "cord": _make_cord}
+UPON: dict[str, Maker] = {name: BESIDE[name] for name in ("pen", "weight", "disc", "box", "cord")}
 
 
 # Places. --------------------------------------------------------------------------------------------------------------
@@ -241,5 +244,5 @@ def _is_clear(parts: list[Part], camera: Camera) -> bool:
 
 def _add(rng: np.random.Generator, parts: list[Part]) -> None:
     for solid, colour, printed in parts:
-        paint = paint_surface(rng, colour, sheet=True)[0] if printed and rng.random() < 0.5 else paint_plain(rng, colour)
-        add_solid(solid, paint)
+        picture = printed and rng.random() < 0.5
+        add_solid(solid, paint_surface(rng, colour, sheet=True)[0] if picture else paint_plain(rng, colour))

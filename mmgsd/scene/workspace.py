@@ -17,17 +17,17 @@ from mathutils import Euler, Vector
 
 from mmgsd.config import RenderConfig
 from mmgsd.scene import randomize, render
+from mmgsd.scene.cloth import EXTENT
 from mmgsd.scene.grounds import Site, draw_ground
 from mmgsd.scene.materials import paint_object, remove_view
 from mmgsd.scene.render import Camera, DeformedObject, View
 from mmgsd.scene.things import add_things
 
-ABSENT = 0.03  # share of the views without the object
+ABSENT = 0.035  # share of the views without the object, of those that nobody has masked
 MAX_TILT_DEG = 50.0
 MAX_OUTSIDE = 0.05  # share of the material points that may fall out of the picture
 LEAST_PX = 4.0  # of a rope's diameter
 TRIES = 60  # to frame the object, before the camera looks straight down
-EXTENTS = {"cloth": 1.0}  # m of a side at rest; of other objects what they span
 
 
 def render_view(
@@ -41,7 +41,7 @@ def render_view(
     colour, texture = paint_object(rng, deformed.mesh)
     site = _describe_site(rng, config, deformed, camera, turn, colour)
     ground, walls, masked = draw_ground(rng, site)
-    present = rng.random() >= ABSENT
+    present = rng.random() >= ABSENT or masked is not None
     visible = render.find_visible(deformed, bvh, camera)
     visible, things = add_things(rng, site, camera, visible, beside=masked is None, walls=walls)
     light = draw_light(rng, scene, site.side, np.append(site.middle, 0.0))
@@ -68,7 +68,7 @@ def _describe_site(
     span = float(np.ptp(deformed.points[:, :2], axis=0).max())
     slender = deformed.is_own_hit is not None
     thickness = deformed.visibility_radius / 2 if slender else 0.0
-    side = 1.0 if config.object == "cloth" else span
+    side = EXTENT if config.object == "cloth" else span
     return Site(deformed.points, side, turn, _find_seen(rng, camera), colour, thickness, slender)
 
 
