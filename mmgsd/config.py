@@ -347,7 +347,12 @@ def digest(config: Config) -> str:
 
 def to_dict(config: Config) -> dict[str, Any]:
     """All fields of a configuration but those of `ADDED` that are as before there was one: what is stored of it."""
-    return {name: value for name, value in dataclasses.asdict(config).items() if value != ADDED.get(name)}
+    return drop_added(dataclasses.asdict(config))
+
+
+def drop_added(values: dict[str, Any]) -> dict[str, Any]:
+    """Values without those of `ADDED` that say nothing new."""
+    return {name: value for name, value in values.items() if value != ADDED.get(name)}
 
 
 def from_dict(kind: type[Config], values: dict[str, Any]) -> Config:

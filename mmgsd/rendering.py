@@ -24,7 +24,7 @@ import pandas as pd
 from dask.distributed import Client, LocalCluster, as_completed
 from tqdm.auto import tqdm
 
-from mmgsd.config import DEFAULT_GROUP, OBJECTS, OWN_GROUP, RenderConfig, find_root, to_dict
+from mmgsd.config import ADDED, DEFAULT_GROUP, OBJECTS, OWN_GROUP, RenderConfig, drop_added, find_root, to_dict
 from mmgsd.dataset import FORMAT, SPLITS, load_dataset
 from mmgsd.sheet import Sheet, load_sheet
 from mmgsd.symmetry import GRID_GROUPS, LINE_GROUPS, load_group, load_mirror
@@ -147,9 +147,10 @@ def _render_batches(client: Client, jobs: dict, partial: Path, config: RenderCon
 
 
 def _check_same_config(config: RenderConfig, stored: dict, folder: Path) -> None:
-    asked = _describe(config)
+    asked, stored = _describe(config), drop_added(stored)
     if stored != asked:
-        changed = [f"{k}: {stored.get(k)!r} there, {v!r} asked for" for k, v in asked.items() if stored.get(k) != v]
+        there, wanted = ADDED | stored, ADDED | asked
+        changed = [f"{k}: {there.get(k)!r} there, {v!r} asked for" for k, v in wanted.items() if there.get(k) != v]
         raise ValueError(f"{folder} holds another data set ({'; '.join(changed)}): use overwrite=True to replace it")
 
 

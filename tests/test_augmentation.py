@@ -181,3 +181,11 @@ def test_without_a_mirror_nothing_is_mirrored(tiny_dataset: Callable[..., Path],
         xy = make_batch(images, np.array([0]), CONFIG, rng, torch.device("cpu")).xy[0].numpy()
         (ax, ay), (bx, by) = xy[24] - xy[0], xy[600] - xy[0]
         assert ax * by - ay * bx > 0
+
+
+def test_an_absent_object_is_nobodys_match(tiny_dataset: Callable[..., Path], rng: np.random.Generator) -> None:
+    images = augmentation.load_training_images(load_dataset(tiny_dataset()), 64)
+    images = dataclasses.replace(images, present=np.array([True, False, True, True]))
+    batch = make_batch(images, np.array([0, 1]), TrainConfig(input_px=64), rng, torch.device("cpu"))
+    assert batch.inside[0].any() and not batch.inside[1].any()
+    assert batch.askable[0].any() and not batch.askable[1].any()

@@ -23,22 +23,41 @@ from mmgsd.config import (
     from_dict,
     load_preset,
     read_flag,
+    to_dict,
 )
 
 OTHER = {  # another accepted value for the fields that are no plain numbers or flags
     "object": "cloth", "method": "pcl", "group": "identity", "network": "lite0", "trunk_weights": "w.safetensors",
     "schedule": "step", "optimiser": "muon", "rotation_deg": 45.0, "bend": 0.25, "groups": 2, "roles": 2,
+    "scene": "workspace",
 }  # fmt: skip
 CONFIGS = (RenderConfig(object="rope"), TrainConfig(object="rope", network="resnet34"), EvaluateConfig(points=600))
 FIELDS = [(config, field.name) for config in CONFIGS for field in dataclasses.fields(config)]
 
 
-@pytest.mark.parametrize("name", ["smoke", "quick", "paper"])
+@pytest.mark.parametrize("name", ["smoke", "quick", "paper", "workspace"])
 def test_preset_configures_both_objects(name: str) -> None:
     preset = load_preset(name)
     assert preset.name == name
     for part in (preset.render, preset.train, preset.ablation):
         assert {key: value.object for key, value in part.items()} == {o: o for o in OBJECTS}
+
+
+def test_the_workspace_preset_differs_from_the_papers_in_the_scene_alone() -> None:
+    paper, workspace = load_preset("paper"), load_preset("workspace")
+    assert workspace.render == {o: dataclasses.replace(r, scene="workspace") for o, r in paper.render.items()}
+    assert workspace.train == paper.train
+
+
+def test_what_is_stored_of_a_plain_scene_is_what_was_stored_before_there_was_another() -> None:
+    stored = to_dict(RenderConfig(object="rope"))
+    assert sorted(stored) == [
+        "ball", "object", "rotation_deg", "samples", "seed", "test_images", "train_images", "views",
+    ]  # fmt: skip
+    assert from_dict(RenderConfig, stored) == RenderConfig(object="rope")
+    assert to_dict(RenderConfig(scene="workspace"))["scene"] == "workspace"
+    with pytest.raises(ValueError, match="scene must be one of 'plain', 'workspace'.*got 'workspaces'"):
+        RenderConfig(scene="workspaces")
 
 
 def test_paper_preset_has_the_papers_sizes() -> None:

@@ -113,6 +113,41 @@ def test_damage_is_refused(tiny_dataset: Callable[..., Path], damage: Callable[[
         check_dataset(folder)
 
 
+def hide_object(folder: Path, *, mask: bool = False) -> None:
+    """Say of the first of the images that it does not show the object; its mask shows it still, if so asked."""
+    def edit(table: pd.DataFrame) -> pd.DataFrame:
+        seen = [v & (i > 0) for i, v in enumerate(table.visible)]
+        return table.assign(present=np.arange(len(table)) > 0, visible=seen)
+
+    edit_labels(folder, edit)
+    if not mask:
+        empty_mask(folder)
+
+
+def test_an_image_without_the_object_has_neither_points_nor_mask(tiny_dataset: Callable[..., Path]) -> None:
+    folder = tiny_dataset()
+    assert load_dataset(folder).present.all()
+    hide_object(folder)
+    assert check_dataset(folder).images.to_dict() == {"train": 4, "test": 2}
+    data = load_dataset(folder)
+    assert data.present.tolist() == [False, True, True, True]
+    assert len(measure_images(data)) == 3
+
+
+def test_an_image_that_shows_the_object_all_the_same_is_refused(tiny_dataset: Callable[..., Path]) -> None:
+    folder = tiny_dataset()
+    hide_object(folder, mask=True)
+    with pytest.raises(DatasetError, match=f"{MASK}: the object is said not to be present, but is seen"):
+        check_dataset(folder)
+
+
+def test_no_pair_is_of_an_image_without_the_object(rng: np.random.Generator) -> None:
+    present = np.array([True, False, True, True])
+    assert 1 not in sample_pairs(np.arange(4), 6, rng, present=present)
+    with pytest.raises(ValueError, match="at least 2 images to make a pair, got 1"):
+        sample_pairs(np.arange(2), 1, rng, present=np.array([True, False]))
+
+
 @pytest.mark.parametrize("object", ["cloth", "rope"])
 def test_whole_data_set_passes(tiny_dataset: Callable[..., Path], object: str) -> None:
     checked = check_dataset(tiny_dataset(object=object, n_train=4, n_test=2))

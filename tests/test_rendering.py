@@ -147,6 +147,16 @@ def test_images_of_an_older_kind_of_cloth_are_not_taken_for_todays(tiny_dataset:
     assert render_dataset(config, folder) == folder
 
 
+def test_a_workspace_is_another_data_set_and_a_plain_one_is_described_as_ever(tmp_path: Path) -> None:
+    assert rendering._describe(CONFIG) == {
+        "object": "rope", "train_images": 3, "test_images": 2, "views": 1, "samples": 1, "rotation_deg": 180.0,
+        "ball": False, "seed": 5, "scenes": 1,
+    }  # fmt: skip
+    rendering._claim(CONFIG, tmp_path)
+    with pytest.raises(ValueError, match="scene: 'plain' there, 'workspace' asked for"):
+        rendering._claim(dataclasses.replace(CONFIG, scene="workspace"), tmp_path)
+
+
 def test_an_object_without_a_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"objects/sock\.json does not exist"):
         render_dataset(dataclasses.replace(CONFIG, object="sock"), tmp_path / "sock", progress=False)

@@ -97,6 +97,13 @@ def test_thickness_varies(ropes: list[RopeShape]) -> None:
     assert thickness.min() < 0.035 < 0.042 < thickness.max()
 
 
+@pytest.mark.parametrize("state", STATES)
+def test_a_thin_cable_is_as_possible_as_a_rope(state: str) -> None:
+    shape = sample_rope(np.random.default_rng(2), state=state, slenderness=(150, 150))
+    assert rope_shape.is_possible(shape) and shape.state == state
+    assert 1 / 175 < shape.thickness / LENGTH < 1 / 120
+
+
 def test_find_crossings_of_a_bow() -> None:
     pairs, angles = find_crossings(np.array([[0.0, 0.0], [2.0, 2.0], [2.0, 0.0], [0.0, 2.0]]))
     assert pairs.tolist() == [[0, 2]]

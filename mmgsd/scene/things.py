@@ -20,6 +20,7 @@ from mmgsd.scene.render import Camera
 from mmgsd.scene.solids import Solid, make_box, make_capsule, make_lathe, make_sheet, make_tube, merge, move
 
 TRIES = 12  # to find a place
+OVER_COUNTS = (0.6, 0.3, 0.1)  # probabilities of 0, 1 and 2 things on the object
 MOST_HIDDEN = 0.5  # share of the points seen that things may cover
 SKINS = ((236, 188, 160), (198, 134, 100), (141, 85, 54), (82, 50, 34), (60, 120, 200), (20, 20, 22))  # and gloves
 
@@ -189,7 +190,7 @@ def _choose(rng: np.random.Generator, site: Site, beside: bool) -> Iterator[tupl
     for _ in range(min(6, rng.poisson(1.6)) if beside else 0):
         name = str(rng.choice(list(around)))
         yield name, around[name], _place_beside
-    for _ in range(int(rng.choice([0, 1, 2], p=[0.6, 0.3, 0.1]))):
+    for _ in range(int(rng.choice(len(OVER_COUNTS), p=OVER_COUNTS))):
         kinds, place = (OVER, _place_over) if rng.random() < 0.65 else (upon, _place_upon)
         name = str(rng.choice(list(kinds)))
         yield name, kinds[name], place
