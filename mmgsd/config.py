@@ -25,6 +25,9 @@ MATCHES_OF_ONE = ("pcl", "unimodal")  # methods that are taught the identity onl
 IMAGE_SIZE = {"cloth": (485, 485), "rope": (640, 480)}  # (width, height) px, paper section "Quantitative Results"
 DEFAULT_GROUP = {"cloth": "c4", "rope": "c2"}
 OWN_GROUP = "own"  # of any other object: what its file says
+# names of no object: a preset keeps other things in folders of these names, beside its data sets
+RESERVED = ("experiments", "models", "notebooks", "queries", "sample", *(f"{name}-broken" for name in OBJECTS),
+            *(f"{name}-{method}" for name in OBJECTS for method in METHODS))  # fmt: skip
 CONTRASTIVE_REVISION = "r2"  # of PCL's and SPCL's training, to be raised with it: no older model passes for a new one
 PASSES = {"lite0": 1, "lite0x2": 2, "lite0x2fine": 2}  # over the feature pyramid
 DETAILED = ("lite0x2fine",)  # whose trunk sees the image at half its size, a light branch at the whole
@@ -53,10 +56,16 @@ def _check(name: str, value: Any, accepted: str, ok: bool) -> None:
 
 
 def _check_object(name: str) -> None:
-    """The cloth, the rope, or a name that an object of the user's own may have."""
-    close = difflib.get_close_matches(str(name), OBJECTS, n=1)
-    if name not in OBJECTS and (close or not re.fullmatch("[a-z][a-z0-9_-]*", str(name))):
-        _check_choice("object", name, (*OBJECTS, "the name of a file in data/objects"))
+    """The cloth, the rope, or a name that an object of the user's own may have, whether its file is there yet or not.
+
+    Where it is needed and missing, `mmgsd.sheet.load_sheet` gives the nearest name.
+    """
+    accepted = (f"{', '.join(map(repr, OBJECTS))} or the name of a file in data/objects: up to 60 letters, digits, "
+                "- and _, a letter first")  # fmt: skip
+    _check("object", name, accepted, name in OBJECTS or re.fullmatch("[A-Za-z][A-Za-z0-9_-]{0,59}", name) is not None)
+    taken = name not in OBJECTS and name.lower() in (*OBJECTS, *RESERVED)  # not every disk tells Cloth from cloth
+    _check("object", name, f"another name than {', '.join(map(repr, (*OBJECTS, *RESERVED)))}, which are taken: "
+           f"{name + '2'!r}, for example", not taken)  # fmt: skip
 
 
 def _check_choice(name: str, value: Any, choices: tuple[str, ...]) -> None:

@@ -136,7 +136,6 @@ def test_unknown_preset_names_the_accepted_ones() -> None:
         (TrainConfig, {"groups": 5}, "groups must be a divisor of batch and pairs"),
         (TrainConfig, {"groups": 16, "pairs": 64}, "at least 2 of 16 images"),
         (TrainConfig, {"prototype_weight": -0.5}, "prototype_weight must be at least 0, or -1"),
-        (RenderConfig, {"object": "colth"}, "did you mean 'cloth'"),
         (RenderConfig, {"object": "../towel"}, "the name of a file in data/objects"),
         (RenderConfig, {"seed": -1}, "seed must be at least 0, got -1"),
         (EvaluateConfig, {"points": 626}, "points must be between 1 and 625, got 626"),
@@ -147,6 +146,37 @@ def test_unknown_preset_names_the_accepted_ones() -> None:
 def test_wrong_value_names_argument_and_what_is_accepted(kind: type, values: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         kind(**values)
+
+
+@pytest.mark.parametrize("kind", [RenderConfig, TrainConfig])
+@pytest.mark.parametrize("name", [
+    "washcloth", "dishcloth", "ropes", "cloths", "towel2", "My_Towel", "tshirt", "cloth-blue", "a", "model", "samples",
+])  # fmt: skip
+def test_an_object_may_have_any_name_that_is_free(kind: type, name: str) -> None:
+    assert kind(object=name).object == name
+
+
+@pytest.mark.parametrize("kind", [RenderConfig, TrainConfig])
+@pytest.mark.parametrize("name", [
+    "models", "queries", "notebooks", "sample", "experiments", "Models", "Cloth", "ROPE", "cloth-spcl", "rope-broken",
+])  # fmt: skip
+def test_a_name_that_is_taken_is_refused(kind: type, name: str) -> None:
+    with pytest.raises(ValueError, match=f"object must be another name than .*'models'.* got '{name}'"):
+        kind(object=name)
+
+
+@pytest.mark.parametrize("name", ["", "a b", "a/b", "../towel", "a.json", ".hidden", "-a", "2", "a\n", "ü", "a" * 61])
+def test_a_name_that_is_none_of_a_file_is_refused(name: str) -> None:
+    with pytest.raises(ValueError, match="object must be 'cloth', 'rope' or the name of a file in data/objects: up to"):
+        RenderConfig(object=name)
+
+
+def test_nothing_that_a_preset_keeps_lies_where_an_objects_data_may() -> None:
+    paths = Paths(Path("root"), "smoke")
+    kept = (paths.model(TrainConfig()), paths.queries("cloth"))
+    for folder in {path.relative_to(paths.generated).parts[0] for path in kept}:
+        with pytest.raises(ValueError, match="another name"):
+            RenderConfig(object=folder)
 
 
 def test_unknown_key_names_the_nearest_one() -> None:

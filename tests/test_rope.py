@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from mmgsd.scene import rope_shape
+from mmgsd.scene import SceneError, rope_shape
 from mmgsd.scene.rope_shape import LENGTH, STATES, OwnPart, RopeShape, find_crossings, resample, sample_rope
 
 SEEDS = 60
@@ -115,6 +115,15 @@ def test_resample_keeps_ends_and_spacing() -> None:
     points = resample(np.column_stack([np.cos(angle), np.sin(angle), 0 * angle]), 101)
     assert points[0] == pytest.approx([1, 0, 0]) and points[-1] == pytest.approx([-1, 0, 0], abs=1e-9)
     assert np.linalg.norm(np.diff(points, axis=0), axis=1) == pytest.approx(np.pi / 100, rel=1e-3)
+
+
+@pytest.mark.parametrize(("name", "nothing"), [("_sample_plan", lambda *_: None), ("is_possible", lambda _: False)])
+def test_a_rope_that_never_lies_well_is_given_up(monkeypatch: pytest.MonkeyPatch, name: str, nothing: object) -> None:
+    monkeypatch.setattr(rope_shape, name, nothing)
+    monkeypatch.setattr(rope_shape, "relax", lambda points, *_: points)
+    monkeypatch.setattr(rope_shape, "SETTLED", 3)
+    with pytest.raises(SceneError, match="'bent'.* 50000 curves were drawn, or 3 suitable ones settled"):
+        sample_rope(np.random.default_rng(0), state="bent")
 
 
 def test_unknown_state_is_an_error() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -12,8 +13,10 @@ import numpy as np
 from mathutils.bvhtree import BVHTree
 
 from mmgsd.config import RenderConfig
+from mmgsd.meshes import SPACING
+from mmgsd.scene import SceneError
 from mmgsd.scene.render import DeformedObject, add_mesh, read_vertices
-from mmgsd.sheet import SPACING, Sheet
+from mmgsd.sheet import Sheet
 from mmgsd.symmetry import grid_group
 
 SIDE = 37  # simulated vertices a side; with 49 a frame takes nearly twice as long
@@ -23,6 +26,7 @@ VISIBILITY_RADIUS = 0.004  # m; less than the distance that self-collision keeps
 STATES = {"flat": 0.10, "wrinkled": 0.24, "folded": 0.26, "folded twice": 0.10, "corner": 0.20, "crumpled": 0.10}
 SETTLE_FRAMES = 8
 ATTEMPTS = 3  # at a move, before the cloth starts anew
+STARTS = 100  # of one cloth at most; a crumpled T-shirt or towel takes two on average
 MAX_STRETCH = 1.22  # of the 99th percentile of edges
 MAX_HEIGHT = 0.17  # m
 MAX_CROSSINGS = 9  # pairs of quads, of 1296, that cut each other: more are seen as spots of the other layer
@@ -66,25 +70,34 @@ def hand_over(
 
 
 def deform(rng: np.random.Generator, state: str, sheet: Sheet | None = None) -> tuple[np.ndarray, int]:
-    """Simulate one state of ``STATES`` of a sheet (None: the square cloth): vertices (V, 3) m, and physics frames."""
+    """Simulate one state of ``STATES`` of a sheet (None: the square cloth): vertices (V, 3) m, and physics frames.
+
+    ValueError for another state; SceneError, which counts why, where the sheet never comes to lie in it.
+    """
     if state not in STATES:
         raise ValueError(f"state must be one of {', '.join(STATES)}, got {state!r}")
-    sheet, frames = sheet or square_sheet(), 0
-    while True:
+    sheet, frames, faults = sheet or square_sheet(), 0, Counter()
+    for _ in range(STARTS):
         vertices = _rippled(rng, sheet, 0.001 if state == "flat" else 0.008)
         for move in _MOVES[state]:
-            vertices, count = _perform(rng, sheet, vertices, move)
+            vertices, count = _perform(rng, sheet, vertices, move, faults)
             frames += count
             if vertices is None:
                 break
         else:
             return vertices, frames
+    reasons = ", ".join(f"{fault} {count} times" for fault, count in faults.most_common())
+    raise SceneError(f"{sheet.name} did not come to lie in the state {state!r} in {STARTS} starts with {ATTEMPTS} "
+                     f"attempts at a move each: it ended {reasons}")  # fmt: skip
 
 
 def _perform(
-    rng: np.random.Generator, sheet: Sheet, start: np.ndarray, move: tuple[Plan, ...]
+    rng: np.random.Generator, sheet: Sheet, start: np.ndarray, move: tuple[Plan, ...], faults: Counter[str]
 ) -> tuple[np.ndarray | None, int]:
-    """The vertices after a move, None where it failed too often, and the frames of physics that all attempts took."""
+    """The vertices after a move, None where it failed too often, and the frames of physics that all attempts took.
+
+    ``faults`` counts why attempts failed.
+    """
     frames = 0
     for _ in range(ATTEMPTS):
         vertices = start.copy()
@@ -92,18 +105,26 @@ def _perform(
             grasps, count = plan(rng, vertices)
             vertices = _simulate(sheet, vertices, grasps, count)
             frames += count
-        if _is_plausible(sheet, vertices):
+        if not (fault := _find_fault(sheet, vertices)):
             return vertices, frames
+        faults[fault] += 1
     return None, frames
 
 
-def _is_plausible(sheet: Sheet, vertices: np.ndarray) -> bool:
-    """Whether the cloth came to lie, hardly stretched and hardly cutting through itself."""
+def _find_fault(sheet: Sheet, vertices: np.ndarray) -> str:
+    """How a cloth lies that is no good; empty where it lies hardly stretched and hardly cutting through itself."""
+    if not np.isfinite(vertices).all():
+        return "nowhere"
     sides = np.sort(np.stack([sheet.faces, np.roll(sheet.faces, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
     a, b = np.unique(sides, axis=0).T
     now, at_rest = (np.linalg.norm(points[a] - points[b], axis=-1) for points in (vertices, sheet.rest))
-    stretched, high = np.quantile(now / at_rest, 0.99) > MAX_STRETCH, np.ptp(vertices[:, 2]) >= MAX_HEIGHT
-    return not stretched and not high and count_crossings(vertices, sheet.faces) <= MAX_CROSSINGS
+    if np.quantile(now / at_rest, 0.99) > MAX_STRETCH:
+        return f"stretched to more than {MAX_STRETCH:g} of its length"
+    if np.ptp(vertices[:, 2]) >= MAX_HEIGHT:
+        return f"{MAX_HEIGHT:g} m high or higher"
+    if count_crossings(vertices, sheet.faces) > MAX_CROSSINGS:
+        return f"cutting through itself at more than {MAX_CROSSINGS} places"
+    return ""
 
 
 def count_crossings(vertices: np.ndarray, faces: np.ndarray) -> int:

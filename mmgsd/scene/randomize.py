@@ -6,6 +6,7 @@ import bpy
 import numpy as np
 from mathutils import Euler, Vector
 
+from mmgsd.scene import SceneError
 from mmgsd.scene.render import Camera
 from mmgsd.scene.textures import (
     BACKGROUNDS,
@@ -19,6 +20,7 @@ from mmgsd.scene.textures import (
 
 MIN_SPAN = 0.8  # m seen across the image at least: a small heap stays small
 MAX_OUTSIDE = 0.05  # share of the material points that may fall out of the image
+POSES = 1000  # drawn for one view at most
 
 
 # Camera. ------------------------------------------------------------------------------------------------------------
@@ -27,13 +29,18 @@ MAX_OUTSIDE = 0.05  # share of the material points that may fall out of the imag
 def draw_camera(
     rng: np.random.Generator, points: np.ndarray, size: tuple[int, int], rotation_deg: float
 ) -> tuple[Camera, float]:
-    """A camera above points (N, 3) m, and the angle (degrees in ±rotation_deg) by which it turns the image."""
+    """A camera above points (N, 3) m, and the angle (degrees in ±rotation_deg) by which it turns the image.
+
+    SceneError where no camera sees nearly all points.
+    """
     turn = rng.uniform(-rotation_deg, rotation_deg)
-    while True:
+    for _ in range(POSES):
         camera = _draw_pose(rng, points, size, np.radians(turn))
         outside = 1 - camera.contains(camera.project(points)).mean()
         if outside <= MAX_OUTSIDE:
             return camera, float(turn)
+    raise SceneError(f"none of {POSES} cameras saw {1 - MAX_OUTSIDE:.0%} of the points, which reach from "
+                     f"{points.min(axis=0).round(2).tolist()} to {points.max(axis=0).round(2).tolist()} m")  # fmt: skip
 
 
 def _draw_pose(rng: np.random.Generator, points: np.ndarray, size: tuple[int, int], turn: float) -> Camera:

@@ -14,12 +14,14 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
+from mmgsd.scene import SceneError
 from mmgsd.scene.rope_relax import EXCLUDE, MIN_RADIUS, STEP, relax
 
-MOST_PLANS = 50_000  # drawn for one rope
 LENGTH = 1.6  # m, of every rope
 USUAL = 50  # diameters that a rope is long; longer ones bend in wider turns
 STATES = {"straight": 0.10, "bent": 0.20, "heavily bent": 0.20, "loops": 0.25, "overhand knot": 0.25}  # probabilities
+PLANS = 50_000  # curves drawn for one rope at most; one with loops takes some 200 on average
+SETTLED = 1000  # of them, suitable ones that are settled on the table at most; one or two will do
 
 
 @dataclass(frozen=True)
@@ -53,23 +55,21 @@ def sample_rope(
     """Draw a rope that rests on the table without cutting through itself.
 
     Args: rng: the only source of randomness; ball: leave room for a ball at the first end; state: one of STATES,
-    drawn if None; slenderness: range of its length in diameters.  Raises ValueError for an unknown state.
+    drawn if None; slenderness: range of its length in diameters.  Raises ValueError for an unknown state, SceneError
+    where no rope of the state comes about.
     """
     if state is not None and state not in STATES:
         raise ValueError(f"state must be one of {', '.join(map(repr, STATES))}, got {state!r}")
     state = state or str(rng.choice(list(STATES), p=list(STATES.values())))
     ball_radius = rng.uniform(1.25, 1.75) * ball  # in diameters
     count = {"loops": int(rng.choice([1, 2, 3], p=[0.4, 0.35, 0.25])), "overhand knot": 3}.get(state, 0)
-    for tries in itertools.count():
-        if tries == MOST_PLANS:  # whatever was asked for: a straight rope always succeeds
-            state, count = "straight", 0
-        plan = _sample_plan(rng, state, count, slenderness)
-        if plan is None:
-            continue
-        points = relax(plan[0], plan[1], ball_radius)
-        shape = _finish(points, state, ball_radius)
-        if len(shape.crossings) == len(plan[2]) and is_possible(shape):
+    plans = (_sample_plan(rng, state, count, slenderness) for _ in range(PLANS))  # lazily: the next is drawn once one has failed
+    for particles, tension, crossings in itertools.islice(filter(None, plans), SETTLED):
+        shape = _finish(relax(particles, tension, ball_radius), state, ball_radius)
+        if len(shape.crossings) == len(crossings) and is_possible(shape):
             return shape
+    raise SceneError(f"no rope in the state {state!r} with {count} crossings and a ball of {ball_radius:.2f} diameters "
+                     f"came to lie: {PLANS} curves were drawn, or {SETTLED} suitable ones settled")  # fmt: skip
 
 
 def resample(points: np.ndarray, count: int) -> np.ndarray:
