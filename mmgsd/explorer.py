@@ -49,6 +49,10 @@ class Pictures(anywidget.AnyWidget):
     method = traitlets.Unicode().tag(sync=True)
     heat_colours = traitlets.Bytes((255 * HEAT).astype(np.uint8).tobytes()).tag(sync=True)  # 256 times R, G, B
 
+    def __repr__(self) -> str:
+        """What stands in a notebook where no widget can be shown."""
+        return "the explorer (run this cell to see it)"
+
 
 class Explorer:
     """The two pictures with everything around them; ``show()`` them in a notebook.

@@ -56,13 +56,13 @@ function drawMode(context, place, unit, colour, { x, y, major, minor, angle }, w
 function drawCross(context, place, unit, colour, [x, y]) {
   const [u, v] = locate(place, x, y);
   context.beginPath();
-  for (const [dx, dy] of [[7 * unit, 0], [0, 7 * unit]]) {
+  for (const [dx, dy] of [[6 * unit, 0], [0, 6 * unit]]) {
     context.moveTo(u - dx, v - dy);
     context.lineTo(u + dx, v + dy);
   }
-  Object.assign(context, { strokeStyle: "black", lineWidth: 6.5 * unit });
+  Object.assign(context, { strokeStyle: "black", lineWidth: 5.5 * unit });
   context.stroke();
-  Object.assign(context, { strokeStyle: colour, lineWidth: 4.5 * unit });
+  Object.assign(context, { strokeStyle: colour, lineWidth: 3.8 * unit });
   context.stroke();
   Object.assign(context, { strokeStyle: "white", lineWidth: 1.5 * unit });
   context.stroke();
