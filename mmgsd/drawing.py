@@ -44,7 +44,9 @@ CHANCE_STYLES = {"centre": "--", "random": ":"}
 COLUMN_IN, PAGE_IN = 3.5, 7.1  # widths of a column and of a page
 MARK = "#FFE100"  # the asked pixel
 
-_HEAT = colormaps["inferno"](np.linspace(0.3, 1, 256))[:, :3].astype(np.float32)
+HEAT = colormaps["inferno"](np.linspace(0.3, 1, 256))[:, :3].astype(np.float32)  # from cold to hot
+FADED = 0.75  # brightness of an image under a heatmap
+
 _SANS = ["DejaVu Sans"]  # comes with matplotlib: the same letters everywhere
 _STYLE = seaborn.axes_style("ticks") | seaborn.plotting_context("paper") | {
     "font.sans-serif": _SANS, "font.size": 7, "axes.labelsize": 7.5, "axes.titlesize": 7.5, "xtick.labelsize": 7,
@@ -120,11 +122,16 @@ def mark_pixel(axis: Axes, x: float, y: float) -> None:
 
 def blend_heatmap(image: np.ndarray, heatmap: np.ndarray) -> np.ndarray:
     """(H, W, 3) uint8: the faded image under the (H, W) heatmap, which is widened a little so as to be seen."""
-    wide = cv2.GaussianBlur(heatmap.astype(np.float32), (0, 0), 0.008 * heatmap.shape[1])
-    strength = np.nan_to_num(np.sqrt(wide / max(wide.max(), 1e-30)))
-    colours = _HEAT[(255 * strength).astype(np.uint8)]  # (H, W, 3)
+    strength = compute_strength(heatmap)
+    colours = HEAT[(255 * strength).astype(np.uint8)]  # (H, W, 3)
     strength = strength[..., None]
-    return (255 * ((1 - strength) * fade_image(image) * 0.75 + strength * colours)).astype(np.uint8)
+    return (255 * ((1 - strength) * fade_image(image) * FADED + strength * colours)).astype(np.uint8)
+
+
+def compute_strength(heatmap: np.ndarray) -> np.ndarray:
+    """(H, W) float32 in [0, 1], how much of the heat covers the image at each pixel of an (H, W) heatmap."""
+    wide = cv2.GaussianBlur(heatmap.astype(np.float32), (0, 0), 0.008 * heatmap.shape[1])
+    return np.nan_to_num(np.sqrt(wide / max(wide.max(), 1e-30)))
 
 
 def fade_image(image: np.ndarray) -> np.ndarray:
