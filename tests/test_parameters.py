@@ -33,7 +33,7 @@ from mmgsd.parameters import (
 from mmgsd.training import train_model
 
 ROOT = Path(__file__).resolve().parents[1]
-NOTEBOOKS = sorted(path for path in (ROOT / "notebooks").glob("*.ipynb"))
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 CHECKED = [path for path in NOTEBOOKS if "read_parameters(globals()" in path.read_text()]
 PRESETS = "'smoke', 'quick', 'paper'"
 
@@ -220,6 +220,10 @@ def test_a_wrong_parameter_is_refused_before_anything_is_touched(empty_root, not
 def test_a_right_one_is_read_as_what_it_means(empty_root, notebook, parameter, given, read):
     got = run_until_it_lacks_data(notebook, **{parameter: given})[parameter]
     assert got == read and type(got) is type(read)
+
+
+def test_every_notebook_checks_its_parameters():
+    assert {path.stem for path in NOTEBOOKS} - {path.stem for path in CHECKED} <= {"explore"}
 
 
 @pytest.mark.parametrize("notebook", [path.stem for path in CHECKED])
