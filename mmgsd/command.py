@@ -32,7 +32,8 @@ def describe_error(error: BaseException) -> str:
     text = " ".join(str(error).split())
     if text and isinstance(error, ValueError | OSError | RuntimeError):
         return text
-    return f"{type(error).__name__}: {text} (set MMGSD_TRACEBACK=1 to see where)"
+    said = f"{type(error).__name__}: {text}" if text else type(error).__name__
+    return f"{said} (set MMGSD_TRACEBACK=1 to see where)"
 
 
 def _leave(sentence: str, code: int) -> None:

@@ -19,6 +19,7 @@ from pathlib import Path
 from dask.distributed import Client, as_completed
 from tqdm.auto import tqdm
 
+from mmgsd.command import run_command
 from mmgsd.config import METHODS, OBJECTS, OWN_STEPS, Paths, Preset, TrainConfig, find_root, load_preset
 from mmgsd.evaluation import (
     BASELINES,
@@ -29,6 +30,7 @@ from mmgsd.evaluation import (
     summarise,
     write_results,
 )
+from mmgsd.parameters import read_scheduler
 from mmgsd.training import WEIGHTS, describe_run, train_model
 
 FIRST = ("mmgsd", "spcl")  # before the studies
@@ -202,7 +204,8 @@ def main() -> None:
     tasks = [task for task in tasks if asked.only in name_task(task)]
     if not tasks:
         parser.error(f"--only {asked.only!r}: no model or baseline of the preset {preset.name} has a name with that")
-    done = run_tasks(tasks, preset, find_root(), scheduler=asked.scheduler)
+    scheduler = read_scheduler("--scheduler", asked.scheduler)
+    done = run_tasks(tasks, preset, find_root(), scheduler=scheduler)
     for name, rmse in tqdm(done, total=len(tasks), desc="models and baselines"):
         tqdm.write(f"{name}: {rmse:.1f} px")
         if asked.seeds:
@@ -212,4 +215,6 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(
+        main, kept="finished models and answers are kept, and the same command goes on from the last checkpoint"
+    )

@@ -27,8 +27,9 @@ import pyarrow.parquet as pq
 from PIL import Image
 from tqdm.auto import tqdm
 
+from mmgsd.command import run_command
 from mmgsd.config import OBJECTS, Paths, find_root, load_preset
-from mmgsd.dataset import SPLITS, Dataset, DatasetError, check_dataset, encode_mask, load_dataset
+from mmgsd.dataset import SPLITS, Dataset, check_dataset, encode_mask, load_dataset
 
 QUALITY = 50  # of WebP, 1 to 100: 4,000 images with their labels stay under 60 MB
 LABEL_STEP = 1 / 16  # px that labels are rounded to
@@ -145,7 +146,10 @@ def _encode_labels(labels: pd.DataFrame, size: tuple[int, int]) -> bytes:
 def _read_note(archive: Path) -> dict:
     for path in (archive, archive.with_suffix(".json")):
         if not path.is_file():
-            raise FileNotFoundError(f"{path} does not exist: an archive and its note belong together")
+            raise FileNotFoundError(
+                f"{path} does not exist: an archive and its note belong together, are made by `make data-pack` on the "
+                "machine that rendered, and are copied here by you, for they are not in git"
+            )
     return json.loads(archive.with_suffix(".json").read_text())
 
 
@@ -177,7 +181,6 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except (ValueError, FileNotFoundError, FileExistsError, DatasetError) as error:
-        raise SystemExit(f"error: {error}") from error
+    run_command(
+        main, kept="finished archives and data sets are kept, an unfinished one is made anew by the same command"
+    )

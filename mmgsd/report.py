@@ -20,6 +20,7 @@ import numpy as np
 
 from mmgsd import report_tables as tables
 from mmgsd.claims import list_claims
+from mmgsd.command import run_command
 from mmgsd.config import IMAGE_SIZE, N_POINTS, OBJECTS, Paths, find_root, load_preset
 
 FILES = ("rmse", "runs", "budget", "sigma", "uncertainty", "symmetry", "broken_symmetry", "errors", "seeds_1000")
@@ -112,4 +113,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

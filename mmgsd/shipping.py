@@ -15,7 +15,9 @@ from pathlib import Path
 import torch
 from safetensors.torch import load_file, save_file
 
+from mmgsd.command import run_command
 from mmgsd.config import OBJECTS, Paths, TrainConfig, find_root, from_dict, load_preset
+from mmgsd.parameters import check_made
 from mmgsd.training import WEIGHTS, load_metadata
 
 SHIPPED = {"mmgsd": "", "spcl": "-spcl"}  # method: what its files' names end with
@@ -99,10 +101,11 @@ def main() -> None:
             if file.is_file():
                 print(restore_model(file, paths.model(models[key]), models[key]))
         return
+    check_made(paths, "04_evaluate", [paths.results / "rmse.json"])
     results = json.loads((paths.results / "rmse.json").read_text())
     for (name, method), model in models.items():
         weights = paths.model(model) / WEIGHTS
-        if not weights.is_file() or method not in results[name]:
+        if not weights.is_file() or method not in results.get(name, {}):
             print(f"{name} {method}: not trained and evaluated yet")
             continue
         facts = {"preset": asked.preset, "data_seed": config.render[name].seed, **results[name][method]}
@@ -111,4 +114,4 @@ def main() -> None:
 
 if __name__ == "__main__":
     torch.set_grad_enabled(False)
-    main()
+    run_command(main)

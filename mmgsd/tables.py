@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import re
 import statistics
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from mmgsd.command import run_command
 from mmgsd.config import LONGER
 
 PAPER = {"cloth": 32.4, "rope": 31.3}  # px, MMGSD's RMSE as the paper reports it
@@ -77,7 +78,7 @@ def make_symmetry_table(results: dict[str, dict[str, Any]]) -> str:
     lines = ["| taught and asked | all | corners | edges | interior |", "|---|---|---|---|---|"]
     for group, row in results.items():
         errors = [row["rmse_mean"], *(row["regions"][region]["rmse_px"] for region in ("corner", "edge", "interior"))]
-        lines.append(f"| {GROUPS[group]} | {' | '.join(f'{error:.1f}' for error in errors)} |")
+        lines.append(f"| {GROUPS.get(group, f'`{group}`')} | {' | '.join(f'{error:.1f}' for error in errors)} |")
     return "\n".join(lines)
 
 
@@ -168,6 +169,16 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "uncertainty_quick": ("quick/uncertainty.json", make_uncertainty_table),
 }
 
+
+def main() -> None:
+    """Update the tables of some documents."""
+    parser = argparse.ArgumentParser(prog="python -m mmgsd.tables", description=__doc__)
+    parser.add_argument("results", type=Path, help="the folder of results, data/results")
+    parser.add_argument("documents", type=Path, nargs="+", help="Markdown files that mark tables")
+    asked = parser.parse_args()
+    for document in asked.documents:
+        update_tables(document, asked.results)
+
+
 if __name__ == "__main__":
-    for name in sys.argv[2:]:
-        update_tables(Path(name), Path(sys.argv[1]))
+    run_command(main)

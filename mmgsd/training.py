@@ -318,6 +318,14 @@ def _repeatable(device: torch.device) -> Iterator[None]:
         deterministic.fill_uninitialized_memory = filled
 
 
+def check_start(config: TrainConfig, models: Path) -> None:
+    """ValueError where ``config.trunk_weights`` do not fit the network, FileNotFoundError where there are none.
+
+    ``models`` is the folder that a model's name is looked for in, before data/weights.
+    """
+    _make_network(config, models)
+
+
 def _make_network(config: TrainConfig, models: Path) -> torch.nn.Module:
     """The network as training starts from it; ``models`` is the folder of the models trained beside it."""
     start, beside = config.trunk_weights, models / config.trunk_weights / WEIGHTS
