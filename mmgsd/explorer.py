@@ -14,10 +14,11 @@ import ipywidgets
 import numpy as np
 import traitlets
 
+from mmgsd.answer import Match
 from mmgsd.baselines import BaselineMatcher
 from mmgsd.dataset import Dataset, sample_pairs
 from mmgsd.drawing import METHOD_LABELS, blend_heatmap, compute_ellipse
-from mmgsd.matching import Match, to_rgb
+from mmgsd.images import to_rgb
 
 QUALITY = 90  # of what the browser is sent, JPEG
 SNAP_PX = 12.0  # a click so near to a material point shows that point's true matches
@@ -132,7 +133,7 @@ class Explorer:
         if self.answer is not None:
             marks["xy"] = self.xy.tolist()
             if self.parts["heatmap"].value:
-                image = blend_heatmap(image, self.answer.heatmap[0])
+                image = blend_heatmap(image, self.answer.compute_heatmap())
             if self.parts["modes"].value:
                 marks["modes"] = describe_modes(self.answer)
             if self.parts["true matches"].value:

@@ -133,7 +133,7 @@ def test_pixels_outside_the_source(matcher: Matcher, image: np.ndarray, bad: tup
         matcher.match(image, image, xy=[(3, 3), bad])
 
 
-@pytest.mark.parametrize("bad", [(3, 4), [(1, 2, 3)], 5])
+@pytest.mark.parametrize("bad", [(3, 4, 5), [(1, 2, 3)], 5, [[[1, 2]]]])
 def test_pixels_of_another_shape(matcher: Matcher, image: np.ndarray, bad: object) -> None:
     with pytest.raises(ValueError, match=r"xy must be \(S, 2\) px, got shape"):
         matcher.match(image, image, xy=bad)
