@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 import mmgsd
+from mmgsd.config import MAX_MODES
 
 EXAMPLE = "example: python -m mmgsd match towel1.jpg towel2.jpg --xy 212,148 --weights FILE --out match.png"
-MAX_MODES = 64  # as in `mmgsd.mixture`, which takes seconds to import
 DPI = 150  # of a picture
 
 

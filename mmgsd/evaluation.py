@@ -43,7 +43,7 @@ def evaluate_model(
     The true matches are those of ``group`` ("" is the object's own), whatever the model was taught. As many modes are
     fitted as a query has true matches, but at least ``modes``: of these the most probable ones are the answer.
     ``temperature`` of the heatmaps is the model's own, calibrated one unless given. ValueError for ``modes`` that are
-    not from 0 to `mmgsd.mixture.MAX_MODES`, for another ``temperature`` than a number above 0, and for weights that
+    not from 0 to `mmgsd.config.MAX_MODES`, for another ``temperature`` than a number above 0, and for weights that
     were taught another object than the data set shows.
     """
     if modes < 0:

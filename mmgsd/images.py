@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ def read_image(path: Path | str) -> np.ndarray:
     if path.stat().st_size == 0:
         raise ValueError(f"{path} is empty: get the image anew")
     try:
-        with Image.open(path) as image:
+        with warnings.catch_warnings(action="ignore"), Image.open(path) as image:  # what matters of them is an error
             return _convert(ImageOps.exif_transpose(image), str(path))
     except UnidentifiedImageError as error:
         raise ValueError(f"{path} is no image that can be read: save it as PNG, JPEG, WebP or TIFF") from error
@@ -80,7 +81,8 @@ def check_pixels(xy: Any, size: tuple[int, int], *, image: str = "image0") -> np
     ValueError otherwise.
     """
     try:
-        points = np.array(_to_array(xy, "xy"), dtype=np.float64)
+        points = np.array(_to_array(xy, "xy"))
+        points = points.astype(np.float64, casting="same_kind" if points.dtype.kind in "biufc" else "unsafe")
     except (TypeError, ValueError) as error:
         raise ValueError(f"xy must be (S, 2) px, got {xy!r:.80}") from error
     if points.shape == (2,) or points.size == 0:

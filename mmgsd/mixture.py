@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from mmgsd.config import ROUNDNESS
+from mmgsd.config import MAX_MODES, ROUNDNESS
 
 ANNEALING, ANNEALING_CYCLES = (4.0, 2.0), 6  # temperatures of the flattened heatmaps fitted first, on half the grid
 CYCLES = 60  # of three EM steps and a leap, at most; a query at rest is left alone
@@ -29,7 +29,6 @@ MIN_VARIANCE = 0.05  # cells²
 PRIOR_WEIGHT = 1.0  # heatmap mass by which each component is a priori as likely as any other
 CHUNK = {"cpu": 2**21, "cuda": 2**26}  # numbers in the largest array of a fit
 MOST_MODES, SAMPLES = 8, 200  # n="auto": the most modes tried; a heatmap weighs as much as so many drawn pixels
-MAX_MODES = 64  # that can be asked for: more than any symmetry of the objects has, and few enough to fit in a moment
 ELLIPSE = 5.991  # squared Mahalanobis distance of the ellipse that holds 95 % of a Gaussian in the plane
 
 
