@@ -35,6 +35,7 @@ NETWORKS = (*PASSES, "resnet34")  # the last is the contrastive papers' referenc
 CONTRASTIVE_MARGIN = 4.0  # of the presets: with the reference's 0.5, lite0's descriptors collapse before they learn
 LONGER = 3  # times the steps of the main table: a model of its own, to see what more training gains
 ROUNDNESS = 0.2  # heatmap mass by which modes are a priori round and equally wide
+MAX_MODES = 64  # that can be asked for: more than any symmetry of the objects has, and few enough to fit in a moment
 ROUNDNESS_OF_SHARP = 0.05  # with which the sharper heatmaps of "mmgsd_muon" have the least error held out
 FINER = 1.5  # times the input, at least, on which another goes on from there
 LONGER_TRAINED = ("mmgsd_long", "mmgsd_fine", "mmgsd_fine_deep", "mmgsd_muon")  # the 2nd and 3rd go on from the 1st

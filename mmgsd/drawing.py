@@ -92,7 +92,7 @@ def show_source(axis: Axes, match: Match, index: int) -> None:
 
 def show_answer(axis: Axes, match: Match, index: int, *, modes: bool = True) -> None:
     """Target with heatmap, and the modes with their 1-std ellipses where asked for."""
-    axis.imshow(blend_heatmap(match.image1, match.heatmap[index]))
+    axis.imshow(blend_heatmap(match.image1, match.compute_heatmap(index)))
     axis.autoscale(False)  # a wide ellipse must not shrink the image
     if modes:
         draw_modes(axis, match, index)

@@ -18,9 +18,9 @@ from tqdm.auto import tqdm
 from mmgsd.baselines import BaselineMatcher, list_baselines
 from mmgsd.config import EvaluateConfig, digest
 from mmgsd.dataset import Dataset, load_dataset, sample_pairs
-from mmgsd.matching import Matcher, read_heatmap
+from mmgsd.matching import Matcher, check_scales, read_heatmap
 from mmgsd.metrics import aggregate, compute_mahalanobis2, compute_query_errors
-from mmgsd.mixture import Mixture
+from mmgsd.mixture import Mixture, check_modes
 from mmgsd.network import compute_cell_centres
 
 BASELINES = list_baselines()  # hand-made descriptors that this OpenCV has
@@ -42,10 +42,16 @@ def evaluate_model(
 
     The true matches are those of ``group`` ("" is the object's own), whatever the model was taught. As many modes are
     fitted as a query has true matches, but at least ``modes``: of these the most probable ones are the answer.
-    ``temperature`` of the heatmaps is the model's own, calibrated one unless given. ValueError for ``modes`` below 0.
+    ``temperature`` of the heatmaps is the model's own, calibrated one unless given. ValueError for ``modes`` that are
+    not from 0 to `mmgsd.config.MAX_MODES`, for another ``temperature`` than a number above 0, and for weights that
+    were taught another object than the data set shows.
     """
     if modes < 0:
         raise ValueError(f"modes must be at least 0, got {modes!r}")
+    if modes:
+        check_modes(modes)
+    if temperature is not None:
+        check_scales(temperature=temperature)
     data = load_dataset(dataset, "test")
     method = hashlib.sha256(Path(weights).read_bytes()).hexdigest()
     method += "" if temperature is None else f" at temperature {temperature:g}"
@@ -242,7 +248,10 @@ def _chance_answer(method: str, data: Dataset) -> Answer:
 
 
 def _describe(matcher: Matcher, data: Dataset, indices: np.ndarray, *, batch: int = 16) -> dict[int, Tensor]:
-    """Descriptors (D, h, w) of the images, computed once each."""
+    """Descriptors (C, h, w) of the images, computed once each; ValueError for images of another object."""
+    if matcher.object and matcher.object != data.object:
+        raise ValueError(f"weights must be of the object {data.object!r} of {data.folder}, got weights of "
+                         f"{matcher.object!r}")  # fmt: skip
     return dict(_describe_batches(matcher, data, indices, batch))
 
 

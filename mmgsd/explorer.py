@@ -23,10 +23,11 @@ import numpy as np
 import traitlets
 
 from mmgsd.__main__ import describe_answer
+from mmgsd.answer import Match
 from mmgsd.baselines import BaselineMatcher
 from mmgsd.drawing import FADED, HEAT, METHOD_LABELS, compute_ellipse, compute_strength, fade_image
-from mmgsd.explorer_scenes import Scene, decode_image
-from mmgsd.matching import Match
+from mmgsd.explorer_scenes import Scene
+from mmgsd.images import decode_image
 
 QUALITY = 90  # of what the browser is sent, JPEG
 DISPLAY_PX = 1600  # longer side of what the browser is sent

@@ -3,26 +3,24 @@
 from __future__ import annotations
 
 import dataclasses
-import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image, ImageOps
 
 from mmgsd.baselines import BaselineMatcher, list_baselines
 from mmgsd.config import OBJECTS, PRESETS, Paths, find_root, load_preset
 from mmgsd.dataset import Dataset, load_dataset, sample_pairs
 from mmgsd.drawing import METHOD_LABELS
-from mmgsd.matching import Matcher, to_rgb
+from mmgsd.images import to_rgb
+from mmgsd.matching import Matcher
 from mmgsd.parameters import find_file
 from mmgsd.training import WEIGHTS
 
 SNAP_PX = 12.0  # a click so near to a material point shows that point's true matches
 SAMPLE = "sample"  # the preset of the images in data/sample
-READABLE = "JPEG, PNG, WebP, TIFF, GIF or BMP"
 
 
 @dataclass(frozen=True)
@@ -118,19 +116,6 @@ def load_shipped(name: str) -> dict[str, Matcher]:
         if matcher.config.object == name:
             matchers[METHOD_LABELS.get(method, method)] = matcher
     return matchers
-
-
-def decode_image(data: bytes, name: str) -> np.ndarray:
-    """(H, W, 3) uint8 of an image file's bytes, upright as its camera noted; ValueError says what can be read."""
-    try:
-        with Image.open(io.BytesIO(data)) as image:
-            return np.array(ImageOps.exif_transpose(image).convert("RGB"))
-    except Image.DecompressionBombError as error:
-        raise ValueError(f"{name} has more pixels than can be read: make it smaller") from error
-    except Exception as error:  # decoders of damaged files raise nearly anything
-        heic = Path(name).suffix.lower() in (".heic", ".heif")
-        kind = "a HEIC image, which" if heic else "no image, or damaged, or of a kind that"
-        raise ValueError(f"{name} is {kind} cannot be read: save it as {READABLE}") from error
 
 
 def _find_dataset(name: str, preset: str) -> Path:
