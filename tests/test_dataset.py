@@ -97,7 +97,7 @@ DAMAGES = {
     "nothing visible": (set_cell("visible", lambda v: v & False), f"{MASK}: no material point is visible"),
     "another format": (set_info(format=2), "dataset.json has format 2, this version reads 1"),
     "keys missing": (drop_key, r"dataset.json lacks the keys \['symmetry'\]"),
-    "no JSON": (lambda folder: (folder / "dataset.json").write_text("{"), "dataset.json is no JSON"),
+    "no JSON": (lambda folder: (folder / "dataset.json").write_text("{"), "dataset.json is damaged or no JSON"),
     "shared simulation": (
         lambda folder: edit_labels(folder, lambda t: t.assign(episode=0)),
         r"cloth: simulations \[0\] are in both splits",

@@ -18,6 +18,7 @@ from dask.distributed import LocalCluster
 from mmgsd import rendering
 from mmgsd.config import RenderConfig
 from mmgsd.dataset import check_dataset, load_dataset
+from mmgsd.files import write_json
 from mmgsd.rendering import RenderError, plan_batches, render_batch, render_dataset
 
 CONFIG = RenderConfig(object="rope", train_images=3, test_images=2, views=1, samples=1, seed=5)
@@ -125,9 +126,10 @@ def wait_for_rendering_worker(pids: set[int]) -> int:
 
 
 def test_a_folder_begun_with_another_configuration_is_not_mixed(tmp_path: Path) -> None:
-    rendering._claim(CONFIG, tmp_path)
+    partial = tmp_path / "rope.partial"
+    write_json(partial / "config.json", rendering._describe(CONFIG))
     with pytest.raises(ValueError, match="samples: 1 there, 2 asked for"):
-        rendering._claim(dataclasses.replace(CONFIG, samples=2), tmp_path)
+        render_dataset(dataclasses.replace(CONFIG, samples=2), tmp_path / "rope", progress=False)
 
 
 def test_a_failing_child_says_why() -> None:
