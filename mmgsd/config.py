@@ -11,6 +11,7 @@ import difflib
 import hashlib
 import json
 import math
+import numbers
 import os
 import re
 from collections.abc import Sequence
@@ -86,6 +87,13 @@ def read_flag(name: str, value: Any) -> bool:
     word = str(value).strip().lower()
     _check(name, value, "true or false (yes, no, on, off, 1, 0)", word in FLAGS)
     return FLAGS[word]
+
+
+def read_count(name: str, value: Any, *, least: int = 0) -> int:
+    """An integer of at least ``least``; ValueError names it otherwise, also where it is a string or a boolean."""
+    _check(name, value, "an integer", isinstance(value, numbers.Integral) and not isinstance(value, bool))
+    _check(name, value, f"at least {least}", value >= least)
+    return int(value)
 
 
 _set_frozen = object.__setattr__  # a field named ``object`` hides the builtin inside a class body

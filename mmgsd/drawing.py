@@ -6,7 +6,6 @@ apart; one method has one colour in every figure.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from mmgsd.config import N_POINTS
+from mmgsd.files import writing
 from mmgsd.matching import Match
 
 METHOD_LABELS = {
@@ -60,14 +60,12 @@ styled = matplotlib.rc_context(_STYLE)
 
 def save_figure(figure: Figure, path: Path, kinds: Sequence[str] = ("pdf", "png")) -> list[Path]:
     """Write ``path`` as PDF without a date (a second run gives the same bytes) and as PNG of 200 dpi; the paths."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     written = []
     for kind in kinds:
         metadata = {"CreationDate": None} if kind == "pdf" else None
-        target, aside = path.with_suffix(f".{kind}"), path.with_suffix(f".{kind}.tmp")
-        with matplotlib.rc_context(_STYLE):
+        target = path.with_suffix(f".{kind}")
+        with matplotlib.rc_context(_STYLE), writing(target) as aside:
             figure.savefig(aside, format=kind, dpi=200, metadata=metadata, bbox_inches="tight", pad_inches=0.01)
-        os.replace(aside, target)
         written.append(target)
     return written
 

@@ -14,7 +14,7 @@ from mmgsd.baselines import BaselineMatcher, list_baselines
 from mmgsd.config import OBJECTS, PRESETS, Paths, find_root, load_preset
 from mmgsd.dataset import Dataset, load_dataset, sample_pairs
 from mmgsd.drawing import METHOD_LABELS
-from mmgsd.images import to_rgb
+from mmgsd.images import decode_image, to_rgb
 from mmgsd.matching import Matcher
 from mmgsd.parameters import find_file
 from mmgsd.training import WEIGHTS

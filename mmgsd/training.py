@@ -6,7 +6,6 @@ import dataclasses
 import json
 import math
 import os
-import shutil
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,8 +14,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import torch
-from safetensors import safe_open
-from safetensors.torch import save_file
 from torch import Tensor
 from torch.nn import functional as F
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
@@ -25,20 +22,29 @@ from tqdm.auto import tqdm
 
 from mmgsd import distributed, losses
 from mmgsd.augmentation import Batch, load_training_images, make_batch
-from mmgsd.config import CONTRASTIVE, DETAILED, MATCHES_OF_ONE, PASSES, TrainConfig, from_dict
+from mmgsd.checkpoints import (
+    CHECKPOINT,
+    LOG,
+    WEIGHTS,
+    check_enough,
+    held,
+    is_trained,
+    read_checkpoint,
+    remove_run,
+    write_checkpoint,
+    write_tensors,
+)
+from mmgsd.checkpoints import describe_run as describe_run  # what others ask of a training
+from mmgsd.checkpoints import load_metadata as load_metadata
+from mmgsd.config import CONTRASTIVE, DETAILED, MATCHES_OF_ONE, PASSES, TrainConfig, read_count, read_flag
 from mmgsd.dataset import Dataset, hold_out, load_dataset
 from mmgsd.evaluation import calibrate_bandwidth, calibrate_temperature, measure_rmse
+from mmgsd.files import DamagedFileError, saying_what_stays, set_aside, write_text
 from mmgsd.matching import Matcher, load
-from mmgsd.network import (
-    build_network,
-    compute_cell_centres,
-    find_device,
-    sample_descriptors,
-)
+from mmgsd.network import build_network, compute_cell_centres, find_device, sample_descriptors
 from mmgsd.optimiser import make_optimisers
 from mmgsd.prototypes import compute_prototype_loss, make_prototypes
 
-WEIGHTS, CHECKPOINT, LOG = "weights.safetensors", "checkpoint.safetensors", "log.csv"
 PROTOTYPE_EVERY = 4  # each step asks every so many material points
 CHECKPOINT_SECONDS = 60.0  # of training between two checkpoints
 
@@ -71,30 +77,37 @@ def train_model(
     and the first one writes the files. The losses and gradients are those of a single process.
 
     A finished model is returned as it is, a killed run goes on from its last checkpoint and ends with the same weights.
+    ``overwrite`` removes weights, checkpoint and log of the folder, nothing else.
     On a CPU two runs on as many threads give the same weights to the last bit; on a GPU they do not.
-    Raises ValueError where the data set is of another object or does not store the symmetry group, and where
-    ``config.trunk_weights`` are of another network; FileNotFoundError where there are none.
+    Raises ValueError where the data set is of another object, does not store the symmetry group or has too few images,
+    and where ``config.trunk_weights`` are of another network; FileNotFoundError where there are none; LockedError while
+    another process trains in the folder.
     """
+    overwrite, progress = read_flag("overwrite", overwrite), read_flag("progress", progress)
+    validate_every, folder = read_count("validate_every", validate_every), Path(folder)
     weights = folder / WEIGHTS
-    if weights.is_file() and not overwrite:
-        if load_metadata(weights).get("data") != load_dataset(dataset, "test").fingerprint:
-            raise ValueError(f"{weights} was trained on another data set than {dataset}: use overwrite=True")
+    if not overwrite and is_trained(weights, dataset):
         return weights
     data = load_dataset(dataset, "train")
     if data.object != config.object:
         raise ValueError(f"object is {config.object!r}, but {dataset} shows a {data.object}")
-    with distributed.joined(config.groups, device or find_device()) as team, _repeatable(team.device):
+    with distributed.joined(config.groups, device or find_device()) as team, held(folder, team), (
+        _repeatable(team.device)
+    ):  # fmt: skip
+        if not overwrite and is_trained(weights, dataset):  # by the process that held the folder before
+            return weights
         run = _Run(config, data, folder, team, validate_every)  # what is wrong is said before anything is deleted
-        if overwrite and team.rank == 0 and folder.exists():
-            shutil.rmtree(folder)
+        if overwrite and team.rank == 0:
+            remove_run(folder)
         team.wait()
         run.resume()
         shown = progress and team.rank == 0
         bar = tqdm(range(run.step, config.steps), desc=config.name, disable=not shown, leave=False)
-        for _ in bar:
-            bar.set_postfix(loss=f"{run.advance():.3f}", refresh=False)
-        if team.rank == 0:
-            run.finish(weights)
+        with saying_what_stays(run.describe_kept):
+            for _ in bar:
+                bar.set_postfix(loss=f"{run.advance():.3f}", refresh=False)
+            if team.rank == 0:
+                run.finish(weights)
         team.wait()
     return weights
 
@@ -140,6 +153,7 @@ class _Run:
     ) -> None:
         self.config, self.folder, self.team, self.validate_every = config, folder, team, validate_every
         self.data, self.held_out = hold_out(data)  # the latter for calibration
+        check_enough(data, self.held_out)
         self.device, self.size = team.device, data.size
         device = team.device
         group = data.group(config.group)
@@ -155,7 +169,7 @@ class _Run:
         self.prototypes = torch.nn.Parameter(start.to(device))
         self.trained = [p for p in self.network.parameters() if p.requires_grad]
         self.optimisers = make_optimisers(self.network, [self.prototypes], config)
-        self.step, self.seconds, self.saved_at, self.log = 0, 0.0, 0.0, []
+        self.step, self.seconds, self.saved_at, self.saved_step, self.log = 0, 0.0, 0.0, 0, []
 
     def advance(self) -> float:
         """One optimiser step; saves a checkpoint every ``CHECKPOINT_SECONDS``."""
@@ -217,30 +231,46 @@ class _Run:
         return measure_rmse(self.make_matcher(), self.held_out)
 
     def save(self) -> None:
-        """Write a checkpoint aside, then rename it."""
-        self.folder.mkdir(parents=True, exist_ok=True)
-        tensors = {"prototypes": self.prototypes.detach()}
-        for part in ("network", "average"):
-            tensors |= {f"{part}/{name}": value for name, value in getattr(self, part).state_dict().items()}
+        """Write a checkpoint whole or not at all."""
+        tensors = {"prototypes": self.prototypes.detach(), **self._list_weights()}
         for number, optimiser in enumerate(self.optimisers):
             for index, values in optimiser.state_dict()["state"].items():
                 tensors |= {f"optimisers/{number}/{index}/{name}": value for name, value in values.items()}
         numbers = {"step": self.step, "seconds": self.seconds, "log": self.log}
-        metadata = {"config": self._describe_config(), "numbers": json.dumps(numbers)}
-        aside = self.folder / (CHECKPOINT + ".tmp")
-        save_file({name: value.contiguous() for name, value in tensors.items()}, aside, metadata)
-        os.replace(aside, self.folder / CHECKPOINT)
-        self.saved_at = self.seconds
+        write_checkpoint(self.folder / CHECKPOINT, tensors, self._describe_config(), numbers)
+        self.saved_at, self.saved_step = self.seconds, self.step
+
+    def describe_kept(self) -> str:
+        """What is on disk of a run that is stopped."""
+        kept = f"its checkpoint of step {self.saved_step} is kept in {self.folder}: call again without overwrite"
+        return f"training was stopped after step {self.step}; {kept if self.saved_step else 'nothing is kept yet'}"
+
+    def _list_weights(self) -> dict[str, Tensor]:
+        parts = {part: getattr(self, part).state_dict() for part in ("network", "average")}
+        return {f"{part}/{name}": value for part, values in parts.items() for name, value in values.items()}
+
+    def _read_checkpoint(self) -> tuple[dict[str, Tensor], dict[str, str]] | None:
+        """The folder's checkpoint, if there is one; the first process sets a damaged one aside before any goes on."""
+        path, found = self.folder / CHECKPOINT, None
+        like = {"prototypes": self.prototypes, **self._list_weights()}
+        if self.team.rank == 0 and path.is_file():
+            try:
+                found = read_checkpoint(path, like, str(self.device))
+            except DamagedFileError:
+                set_aside(path)
+        self.team.wait()
+        if self.team.rank and path.is_file():
+            found = read_checkpoint(path, like, str(self.device))
+        return found
 
     def resume(self) -> None:
         """Go on from the folder's checkpoint, if there is one; ValueError where it is of another configuration."""
-        path = self.folder / CHECKPOINT
-        if not path.is_file():
+        found = self._read_checkpoint()
+        if found is None:
             return
-        with safe_open(path, "pt", device=str(self.device)) as file:
-            metadata = file.metadata()
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        tensors, metadata = found
         if metadata["config"] != self._describe_config():
+            path = self.folder / CHECKPOINT
             raise ValueError(f"{path} belongs to another configuration: choose another folder or overwrite=True")
         self.prototypes.data.copy_(tensors.pop("prototypes"))
         parts = {"network": {}, "average": {}, "optimisers": {}}
@@ -260,15 +290,19 @@ class _Run:
             optimiser.load_state_dict({**optimiser.state_dict(), "state": state})
         numbers = json.loads(metadata["numbers"])
         self.step, self.seconds, self.log = numbers["step"], numbers["seconds"], numbers["log"]
-        self.saved_at = self.seconds
+        self.saved_at, self.saved_step = self.seconds, self.step
 
     def _describe_config(self) -> str:
         return json.dumps(dataclasses.asdict(self.config))
 
     def finish(self, weights: Path) -> Path:
-        """Write log and weights, the weights last: a folder that has them is finished."""
-        self.folder.mkdir(parents=True, exist_ok=True)
-        pd.DataFrame(self.log).to_csv(self.folder / LOG, index=False)
+        """Write log and weights, the weights last: a folder that has them is finished.
+
+        The trained weights are in a checkpoint before they are calibrated: what fails there costs no training.
+        """
+        if self.saved_step < self.step:
+            self.save()
+        write_text(self.folder / LOG, pd.DataFrame(self.log).to_csv(index=False))
         metadata = {
             "format": "mmgsd-1",
             "config": json.dumps(dataclasses.asdict(self.config)),
@@ -283,26 +317,9 @@ class _Run:
         if matcher.bandwidth is not None:
             metadata["bandwidth"] = repr(matcher.bandwidth)
         metadata["temperature"] = repr(calibrate_temperature(matcher, self.held_out))
-        state = {name: value.contiguous() for name, value in self.average.module.state_dict().items()}
-        aside = weights.with_suffix(".tmp")
-        save_file(state, aside, metadata)
-        os.replace(aside, weights)
+        write_tensors(weights, self.average.module.state_dict(), metadata)
         (self.folder / CHECKPOINT).unlink(missing_ok=True)
         return weights
-
-
-def load_metadata(weights: Path | str) -> dict[str, str]:
-    """What a weights file says of itself: ``config``, ``seconds`` of training, ``hardware``, ``images``, …"""
-    with safe_open(weights, "pt") as file:
-        return file.metadata() or {}
-
-
-def describe_run(weights: Path | str) -> dict[str, int | float | str]:
-    """Which model it is and what it cost: its name, steps, minutes, training images, seed, hardware."""
-    note = load_metadata(weights)
-    config, minutes = from_dict(TrainConfig, json.loads(note["config"])), round(float(note["seconds"]) / 60, 2)
-    run = {"model": config.name, "steps": config.steps, "minutes": minutes, "images": int(note["images"])}
-    return {**run, "seed": config.seed, "hardware": note["hardware"]}
 
 
 @contextmanager

@@ -39,6 +39,11 @@ def set_cell(column: str, change: Callable[[np.ndarray], object]) -> Callable[[P
     return lambda folder: edit_labels(folder, edit)
 
 
+def set_cell_of_text(column: str, text: str) -> Callable[[Path], None]:
+    """Replaces the first row's text of a column."""
+    return lambda folder: edit_labels(folder, lambda t: t.assign(**{column: [text, *t[column].iloc[1:]]}))
+
+
 def set_info(**values: object) -> Callable[[Path], None]:
     def damage(folder: Path) -> None:
         path = folder / "dataset.json"
@@ -95,9 +100,31 @@ DAMAGES = {
     "xy not finite": (set_cell("xy", with_nan), "labels.parquet: xy holds values that are not finite"),
     "xy outside": (set_cell("xy", with_far_point), f"labels.parquet: a visible point of {MASK} lies outside"),
     "nothing visible": (set_cell("visible", lambda v: v & False), f"{MASK}: no material point is visible"),
+    "image elsewhere": (set_cell_of_text("file", "../../secret.webp"), "labels.parquet: file must be like .*secret"),
+    "image of an absolute path": (set_cell_of_text("file", "/etc/secret.webp"), "file must be like .*secret"),
+    "mask in a deeper folder": (set_cell_of_text("mask", "masks/../images/a.png"), "mask must be like"),
+    "a file twice": (set_cell_of_text("file", "images/00001.webp"), "file names a file twice"),
+    "markup as a state": (set_cell_of_text("state", "<script>"), "state must be like .*<script>"),
+    "a negative simulation": (lambda folder: edit_labels(folder, lambda t: t.assign(episode=-1)), "episode must hold"),
+    "words for numbers": (
+        lambda folder: edit_labels(folder, lambda t: t.assign(intrinsics=[["a"] * 9] * len(t))),
+        "labels.parquet: intrinsics must hold numbers",
+    ),
+    "labels of another checksum": (set_info(labels_sha256="0" * 64), "labels.parquet is damaged: its SHA-256"),
+    "markup as an object": (set_info(object="<b>"), "dataset.json: object must be a name .*'<b>'"),
+    "size of text": (set_info(size=["485", "485"]), r"dataset.json: size must be \[width, height\]"),
+    "a huge size": (set_info(size=[10**6, 10**6]), "dataset.json: size must be"),
+    "markup as a group": (set_info(symmetry={"<b>": [[0]]}), "dataset.json: symmetry must be permutations"),
+    "no permutation": (set_info(symmetry={"c4": [[0, 0]]}), "dataset.json: symmetry must be permutations"),
+    "a group that is not there": (set_info(default_group="c9"), "default_group must be one of symmetry's"),
+    "a setting that is none": (set_info(config={"views": "many"}), "dataset.json: config must be what RenderConfig"),
+    "no number of images": (set_info(images={"train": "4"}), "dataset.json: images must be the number"),
+    "markup as a version": (set_info(versions={"bpy": "<b>"}), "dataset.json: versions must be"),
+    "a mirror that is none": (set_info(mirror=[0, 0, 1]), "dataset.json: mirror must be null, or each"),
+    "a list": (lambda folder: (folder / "dataset.json").write_text("[]"), "dataset.json must hold an object with keys"),
     "another format": (set_info(format=2), "dataset.json has format 2, this version reads 1"),
     "keys missing": (drop_key, r"dataset.json lacks the keys \['symmetry'\]"),
-    "no JSON": (lambda folder: (folder / "dataset.json").write_text("{"), "dataset.json is no JSON"),
+    "no JSON": (lambda folder: (folder / "dataset.json").write_text("{"), "dataset.json is damaged or no JSON"),
     "shared simulation": (
         lambda folder: edit_labels(folder, lambda t: t.assign(episode=0)),
         r"cloth: simulations \[0\] are in both splits",

@@ -63,7 +63,8 @@ def sample_rope(
     state = state or str(rng.choice(list(STATES), p=list(STATES.values())))
     ball_radius = rng.uniform(1.25, 1.75) * ball  # in diameters
     count = {"loops": int(rng.choice([1, 2, 3], p=[0.4, 0.35, 0.25])), "overhand knot": 3}.get(state, 0)
-    plans = (_sample_plan(rng, state, count, slenderness) for _ in range(PLANS))  # lazily: the next is drawn once one has failed
+    # lazily: the next is drawn once one has failed
+    plans = (_sample_plan(rng, state, count, slenderness) for _ in range(PLANS))
     for particles, tension, crossings in itertools.islice(filter(None, plans), SETTLED):
         shape = _finish(relax(particles, tension, ball_radius), state, ball_radius)
         if len(shape.crossings) == len(crossings) and is_possible(shape):
