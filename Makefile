@@ -68,7 +68,8 @@ readme: $(STAMP) ## Put the numbers of data/results into the tables of README.md
 data-pack: $(STAMP) ## Pack the data sets of PRESET (paper) into data/packs, to travel to another machine
 	$(PY) -m mmgsd.packing pack $(PRESET)
 
-data-unpack: $(STAMP) ## Unpack them there; the SHA-256 must be that of the note beside the archive
+# No archive is in git or on the web: each comes from a machine that rendered, where make data-pack made it.
+data-unpack: $(STAMP) ## Unpack them there, once data/packs has both archives of PRESET and their notes, copied by you
 	$(PY) -m mmgsd.packing unpack $(PRESET)
 
 data-sample: $(STAMP) ## Copy 24 images of each object of PRESET into data/sample
@@ -91,21 +92,25 @@ lab: $(STAMP) ## Open the notebooks in JupyterLab
 # --- installation ------------------------------------------------------------------------------------------------
 .venv: $(STAMP) ## Make the virtual environment from environment.lock (CUDA=1: torch with CUDA)
 
-# A CPU environment is made anew where CUDA is asked for; a CUDA environment stays one.
-ifeq ($(CUDA),1)
-ifneq ($(shell cat $(STAMP) 2>/dev/null),cuda)
+# The stamp, written last, says which torch is installed and from which environment.lock, by its content: a checkout
+# changes the file's date. A CPU environment is made anew where CUDA is asked for; a CUDA environment stays one.
+LOCKED := $(shell sha256sum environment.lock 2>/dev/null | cut -c-64)
+ifeq ($(filter $(if $(filter 1,$(CUDA)),,cpu-$(LOCKED)) cuda-$(LOCKED),$(shell cat $(STAMP) 2>/dev/null)),)
 $(STAMP): force
-endif
 endif
 
 # torch comes before the rest, for it is the one package that pip may need an extra index for: what follows finds it
 # installed, and its absence is told in a second instead of after all other downloads. The .pth file makes
 # the folder mmgsd importable as it stands.
-$(STAMP): environment.lock
+$(STAMP): | environment.lock
+	@[ ! -L .venv ] || { \
+		echo ".venv is a link to $$(readlink .venv), which was not made from this environment.lock and would be emptied:" \
+			"remove the link (rm .venv) to have an environment made here, or run make there." >&2; exit 1; }
 	@[ -n "$(PYTHON)" ] && "$(PYTHON)" -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' 2>/dev/null || { \
 		echo "mmgsd needs Python 3.11, the only version its Blender module is built for:" \
 			"install it, or name it with PYTHON=/path/to/python3.11." >&2; exit 1; }
 	@echo "Making .venv from environment.lock: two minutes or more, 3 GB on disk"
+	@rm -f $@
 	"$(PYTHON)" -m venv --clear .venv
 	@awk '/^torch==/ { on = 1; print; next } /^[^ #]/ { on = 0 } on' environment.lock > .venv/torch.lock
 	@awk '/^torch==/ { on = 1; next } /^[^ #]/ { on = 0 } !on' environment.lock > .venv/rest.lock
@@ -120,7 +125,8 @@ else
 	$(PIP) --require-hashes -r environment.lock
 endif
 	@pwd > "$$($(PY) -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/mmgsd.pth"
-	@echo $(if $(filter 1,$(CUDA)),cuda,cpu) > $@
+	@echo $(if $(filter 1,$(CUDA)),cuda,cpu)-$(LOCKED) > $@.new
+	@mv $@.new $@
 
 lock: ## Make environment.lock from pyproject.toml (UV=uv, FIND_LINKS=folder with torch's CPU wheel)
 	@{ echo "# Every package of the project, pinned and hashed, for Python 3.11 on Linux x86-64. Made from pyproject.toml by"; \

@@ -4,24 +4,44 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
+import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import mmgsd
+from mmgsd.config import MAX_MODES
 
 EXAMPLE = "example: python -m mmgsd match towel1.jpg towel2.jpg --xy 212,148 --weights FILE --out match.png"
+DPI = 150  # of a picture
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run a command; exits with 1 where a file does not do, and with 2 for a wrong argument."""
+    """Run a command.
+
+    Exits with 2 and one sentence for a wrong argument or a file that does not do, with 1 where the result cannot be
+    written, and with 130 after Ctrl-C.
+    """
     parser = make_parser()
     asked = parser.parse_args(arguments)
     try:
         {"match": _match, "export": _export}[asked.command](asked)
-    except (ValueError, OSError, RuntimeError) as error:
-        parser.exit(1, f"error: {error}\n")
+    except KeyboardInterrupt:
+        kept = f"{asked.out} is as it was before" if asked.out else "there was nothing to keep"
+        parser.exit(130, f"stopped: {kept}\n")
+    except BrokenPipeError:  # who reads the output has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except (ValueError, FileNotFoundError, IsADirectoryError, PermissionError) as error:
+        parser.exit(2, f"error: {_say(error)}\n")
+    except (OSError, RuntimeError, MemoryError) as error:
+        parser.exit(1, f"error: {_say(error)}\n")
+
+
+def _say(error: BaseException) -> str:
+    """An error in one line."""
+    return " ".join(str(error).split()) or type(error).__name__
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -45,19 +65,33 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def _match(asked: argparse.Namespace) -> None:
+    _check_out(asked)
     images = [mmgsd.read_image(path) for path in (asked.image0, asked.image1)]
     answer = mmgsd.load(asked.weights).match(*images, asked.xy, n=asked.n)
     described = describe_answer(answer)
-    print(json.dumps(described) if asked.json else "\n".join(map(_format_query, described)))
     if asked.out:
         _draw(answer, asked.out)
+    print(json.dumps(described) if asked.json else "\n".join(map(_format_query, described)), flush=True)
+
+
+def _check_out(asked: argparse.Namespace) -> None:
+    """ValueError for a picture that would replace an image, or hold more queries than a page does."""
+    if not asked.out:
+        return
+    from mmgsd.plots import PAGE_QUERIES
+
+    if asked.out.resolve() in (asked.image0.resolve(), asked.image1.resolve()):
+        raise ValueError(f"--out must not be one of the images, got {asked.out}")
+    if len(asked.xy) > PAGE_QUERIES:
+        raise ValueError(f"--xy must be given at most {PAGE_QUERIES} times with --out, got {len(asked.xy)}")
 
 
 def _export(asked: argparse.Namespace) -> None:
     from mmgsd.exporting import export_onnx
 
     difference = export_onnx(mmgsd.load(asked.weights), asked.out)
-    print(f"{asked.out}: descriptors differ from torch's by {difference:.1e} at most")
+    print(f"{asked.out}: images of any size in, descriptors as of Matcher.describe out, the mean over quarter turns "
+          f"included; they differ from torch's by {difference:.1e} at most")  # fmt: skip
 
 
 def describe_answer(answer: Any) -> list[dict[str, Any]]:
@@ -86,15 +120,16 @@ def _format_query(query: dict[str, Any]) -> str:
 
 
 def _draw(answer: Any, path: Path) -> None:
-    """All queries, one below the other."""
+    """One query as two large panels, several as a page."""
     import matplotlib
 
     matplotlib.use("Agg")
-    from mmgsd.plots import plot_teaser
+    from mmgsd.files import writing
+    from mmgsd.plots import plot_page
 
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure = answer.plot() if len(answer.xy) == 1 else plot_teaser({"": [answer[k] for k in range(len(answer.xy))]})
-    figure.savefig(path)
+    figure = answer.plot() if len(answer) == 1 else plot_page(answer)
+    with writing(path) as aside:
+        figure.savefig(aside, format=path.suffix[1:].lower(), dpi=DPI)
 
 
 def _parse_pixel(text: str) -> tuple[float, float]:
@@ -114,9 +149,9 @@ def _parse_picture(text: str) -> Path:
 
 
 def _parse_number(text: str) -> int | str:
-    if text == "auto" or (text.isdigit() and int(text) > 0):
+    if text == "auto" or (text.isdecimal() and len(text) < 4 and 1 <= int(text) <= MAX_MODES):
         return text if text == "auto" else int(text)
-    raise argparse.ArgumentTypeError(f"must be a number from 1 on, or auto, got {text!r}")
+    raise argparse.ArgumentTypeError(f"must be a number from 1 to {MAX_MODES}, or auto, got {text!r}")
 
 
 if __name__ == "__main__":

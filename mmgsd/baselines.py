@@ -9,6 +9,7 @@ estimated at each pixel as SIFT or ORB do at their keypoints; DAISY has none and
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,7 +18,10 @@ import skimage.feature
 import torch
 from torch import Tensor
 
-from mmgsd.matching import Match, check_question, make_match
+from mmgsd.answer import Match
+from mmgsd.images import check_pixels, check_question
+from mmgsd.matching import make_match
+from mmgsd.mixture import check_modes
 
 BASELINES = ("sift", "orb", "akaze", "daisy", "surf")
 BINARY = ("orb", "akaze")  # compared by Hamming distance
@@ -57,6 +61,7 @@ class BaselineMatcher:
     def __init__(self, method: str, *, modes: int = 1) -> None:
         _check_choice(method)
         _create_extractor(method)
+        check_modes(modes)
         self.method, self.modes = method, modes
 
     def compute_heatmaps(
@@ -67,14 +72,14 @@ class BaselineMatcher:
         return torch.from_numpy(heatmap), (torch.from_numpy(grid[0, :, 0]), torch.from_numpy(grid[:, 0, 1]))
 
     def match(
-        self, image0: np.ndarray, image1: np.ndarray, xy: np.ndarray | list, *,
-        n: int | str | None = None, mask1: np.ndarray | None = None,
+        self, image0: np.ndarray, image1: np.ndarray, xy: Any, *, n: Any = None,
+        mask1: np.ndarray | None = None,
     ) -> Match:  # fmt: skip
         """As `Matcher.match`; ``mask1`` (H1, W1) bool tells where the object is in ``image1``, else anywhere."""
         image0, image1, points = check_question(image0, image1, xy)
         mask1 = np.ones(image1.shape[:2], bool) if mask1 is None else mask1
         cells, centres = self.compute_heatmaps(image0, image1, points, mask1)
-        return make_match(image0, image1, points, cells, centres, self.modes if n is None else n)
+        return make_match(image0, image1, points, cells, centres, n, fitted=self.modes)
 
 
 def compute_baseline_heatmap(
@@ -97,7 +102,7 @@ def compute_baseline_heatmap(
     _check_choice(method)
     _check_image("image0", image0)
     _check_image("image1", image1)
-    xy = _check_xy(xy, image0)
+    xy = check_pixels(xy, image0.shape[1::-1])
     grid = compute_grid(image1.shape[:2], stride=stride)
     on_object = _sample_mask(mask1, image1, grid)  # (h, w)
     source = compute_descriptors(image0, xy, method=method)  # (S, K)
@@ -122,7 +127,7 @@ def compute_descriptors(image: np.ndarray, xy: np.ndarray, *, method: str) -> np
     """
     _check_choice(method)
     _check_image("image", image)
-    xy = _check_xy(xy, image)
+    xy = check_pixels(xy, image.shape[1::-1], image="the image")
     grey = np.pad(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), PAD_PX, mode="symmetric")
     if not len(xy):
         return np.zeros((0, 1), np.float32)
@@ -258,14 +263,3 @@ def _check_image(name: str, image: np.ndarray) -> None:
         raise ValueError(f"{name} must be an RGB image, (H, W, 3) uint8, got {got}")
     if min(image.shape[:2]) < 16:
         raise ValueError(f"{name} must be at least 16 px wide and high, got shape {image.shape}")
-
-
-def _check_xy(xy: np.ndarray, image: np.ndarray) -> np.ndarray:
-    points = np.asarray(xy, dtype=np.float32)
-    if points.ndim != 2 or points.shape[1] != 2:
-        raise ValueError(f"xy must be (S, 2) px, got shape {points.shape}")
-    limit = np.array(image.shape[1::-1]) - 0.5
-    if not (np.isfinite(points) & (points >= -0.5) & (points <= limit)).all():
-        bad = points[~(np.isfinite(points) & (points >= -0.5) & (points <= limit)).all(1)][0].tolist()
-        raise ValueError(f"xy must be finite and inside the image of {image.shape[1]} x {image.shape[0]} px, got {bad}")
-    return points

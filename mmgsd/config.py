@@ -11,6 +11,7 @@ import difflib
 import hashlib
 import json
 import math
+import numbers
 import os
 import re
 from collections.abc import Sequence
@@ -25,6 +26,9 @@ MATCHES_OF_ONE = ("pcl", "unimodal")  # methods that are taught the identity onl
 IMAGE_SIZE = {"cloth": (485, 485), "rope": (640, 480)}  # (width, height) px, paper section "Quantitative Results"
 DEFAULT_GROUP = {"cloth": "c4", "rope": "c2"}
 OWN_GROUP = "own"  # of any other object: what its file says
+# names of no object: a preset keeps other things in folders of these names, beside its data sets
+RESERVED = ("experiments", "models", "notebooks", "queries", "sample", *(f"{name}-broken" for name in OBJECTS),
+            *(f"{name}-{method}" for name in OBJECTS for method in METHODS))  # fmt: skip
 CONTRASTIVE_REVISION = "r2"  # of PCL's and SPCL's training, to be raised with it: no older model passes for a new one
 PASSES = {"lite0": 1, "lite0x2": 2, "lite0x2fine": 2}  # over the feature pyramid
 DETAILED = ("lite0x2fine",)  # whose trunk sees the image at half its size, a light branch at the whole
@@ -32,6 +36,7 @@ NETWORKS = (*PASSES, "resnet34")  # the last is the contrastive papers' referenc
 CONTRASTIVE_MARGIN = 4.0  # of the presets: with the reference's 0.5, lite0's descriptors collapse before they learn
 LONGER = 3  # times the steps of the main table: a model of its own, to see what more training gains
 ROUNDNESS = 0.2  # heatmap mass by which modes are a priori round and equally wide
+MAX_MODES = 64  # that can be asked for: more than any symmetry of the objects has, and few enough to fit in a moment
 ROUNDNESS_OF_SHARP = 0.05  # with which the sharper heatmaps of "mmgsd_muon" have the least error held out
 FINER = 1.5  # times the input, at least, on which another goes on from there
 LONGER_TRAINED = ("mmgsd_long", "mmgsd_fine", "mmgsd_fine_deep", "mmgsd_muon")  # the 2nd and 3rd go on from the 1st
@@ -54,10 +59,16 @@ def _check(name: str, value: Any, accepted: str, ok: bool) -> None:
 
 
 def _check_object(name: str) -> None:
-    """The cloth, the rope, or a name that an object of the user's own may have."""
-    close = difflib.get_close_matches(str(name), OBJECTS, n=1)
-    if name not in OBJECTS and (close or not re.fullmatch("[a-z][a-z0-9_-]*", str(name))):
-        _check_choice("object", name, (*OBJECTS, "the name of a file in data/objects"))
+    """The cloth, the rope, or a name that an object of the user's own may have, whether its file is there yet or not.
+
+    Where it is needed and missing, `mmgsd.sheet.load_sheet` gives the nearest name.
+    """
+    accepted = (f"{', '.join(map(repr, OBJECTS))} or the name of a file in data/objects: up to 60 letters, digits, "
+                "- and _, a letter first")  # fmt: skip
+    _check("object", name, accepted, name in OBJECTS or re.fullmatch("[A-Za-z][A-Za-z0-9_-]{0,59}", name) is not None)
+    taken = name not in OBJECTS and name.lower() in (*OBJECTS, *RESERVED)  # not every disk tells Cloth from cloth
+    _check("object", name, f"another name than {', '.join(map(repr, (*OBJECTS, *RESERVED)))}, which are taken: "
+           f"{name + '2'!r}, for example", not taken)  # fmt: skip
 
 
 def _check_choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
@@ -77,6 +88,13 @@ def read_flag(name: str, value: Any) -> bool:
     word = str(value).strip().lower()
     _check(name, value, "true or false (yes, no, on, off, 1, 0)", word in FLAGS)
     return FLAGS[word]
+
+
+def read_count(name: str, value: Any, *, least: int = 0) -> int:
+    """An integer of at least ``least``; ValueError names it otherwise, also where it is a string or a boolean."""
+    _check(name, value, "an integer", isinstance(value, numbers.Integral) and not isinstance(value, bool))
+    _check(name, value, f"at least {least}", value >= least)
+    return int(value)
 
 
 _set_frozen = object.__setattr__  # a field named ``object`` hides the builtin inside a class body
@@ -354,7 +372,12 @@ def digest(config: Config) -> str:
 
 def to_dict(config: Config) -> dict[str, Any]:
     """All fields of a configuration but those of `ADDED` that are as before there was one: what is stored of it."""
-    return {name: value for name, value in dataclasses.asdict(config).items() if value != ADDED.get(name)}
+    return drop_added(dataclasses.asdict(config))
+
+
+def drop_added(values: dict[str, Any]) -> dict[str, Any]:
+    """Values without those of `ADDED` that say nothing new."""
+    return {name: value for name, value in values.items() if value != ADDED.get(name)}
 
 
 def from_dict(kind: type[Config], values: dict[str, Any]) -> Config:

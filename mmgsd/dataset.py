@@ -1,6 +1,7 @@
 """The data set on disk: its format, its checker and reader, and how pairs of images are drawn from it.
 
-dataset.json      object, image size, symmetry groups, mirror (optional), seed, versions, number of images of each split
+dataset.json      object, image size, symmetry groups, mirror (optional), seed, versions, number of images of each
+                  split, SHA-256 of labels.parquet (optional); `mmgsd.dataset_format` tests each
 labels.parquet    one row an image: file, mask, split, episode, view, xy, visible, intrinsics, camera_pose, state …;
                   present (optional), False where the object is not there: no visible point, an empty mask
 images/*.webp     lossless colour images          masks/*.png    1-bit object masks
@@ -12,24 +13,21 @@ import dataclasses
 import hashlib
 import io
 import json
+import struct
+import zlib
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
+from mmgsd.dataset_format import REMEDY, SPLITS, DatasetError, count_points, read_info, read_labels
 from mmgsd.symmetry import SymmetryGroup
 
-FORMAT = 1
-SPLITS = ("train", "test")
-REQUIRED_COLUMNS = ("file", "mask", "split", "episode", "view", "xy", "visible", "intrinsics", "camera_pose")
-REQUIRED_KEYS = ("format", "object", "size", "symmetry", "default_group", "config", "images", "versions")
-
-
-class DatasetError(ValueError):
-    """A data set's file is missing, truncated or not of the format; the message names the file."""
+UNREADABLE_IMAGE = (OSError, ValueError, TypeError, SyntaxError, LookupError, ArithmeticError, struct.error, zlib.error,
+                    Image.DecompressionBombError)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -61,7 +59,7 @@ class Dataset:
     @property
     def n_points(self) -> int:
         """Number of material points P."""
-        return _count_points(self.info)
+        return count_points(self.info)
 
     @cached_property
     def xy(self) -> np.ndarray:
@@ -107,11 +105,7 @@ class Dataset:
         """Where each material point (P,) goes in a mirror image, None for an object that has no mirror image."""
         if self.info.get("mirror") is None:
             return None
-        points = np.asarray(self.info["mirror"])
-        if not np.array_equal(np.sort(points), np.arange(self.n_points)):
-            place, last = self.folder / "dataset.json", self.n_points - 1
-            raise DatasetError(f"{place}: mirror must hold each of 0 to {last} once")
-        return points
+        return np.asarray(self.info["mirror"])
 
     def load_image(self, index: int) -> np.ndarray:
         """(H, W, 3) uint8; DatasetError where the file is missing, truncated or of another size."""
@@ -131,13 +125,13 @@ def load_dataset(folder: Path | str, split: str = "train") -> Dataset:
     folder = Path(folder)
     if split not in SPLITS:
         raise ValueError(f"split must be one of {SPLITS}, got {split!r}")
-    info = _read_info(folder / "dataset.json")
+    info = read_info(folder / "dataset.json")
     if split not in info["images"]:
         raise ValueError(f"{folder} has no {split} images: render them as well (without only_test)")
-    labels = _read_labels(folder / "labels.parquet", info)
+    labels = read_labels(folder / "labels.parquet", info)
     for name in [*labels.file, *labels["mask"]]:
         if not (folder / name).is_file():
-            raise DatasetError(f"{folder / name} is missing: render the data set again with overwrite=True")
+            raise DatasetError(f"{folder / name} is missing: {REMEDY}")
     return Dataset(folder, split, info, labels[labels.split == split].reset_index(drop=True))
 
 
@@ -146,7 +140,7 @@ def check_dataset(folder: Path | str) -> pd.DataFrame:
 
     Raises DatasetError at the first violation, with the file's name.
     """
-    rows, info = [], _read_info(Path(folder) / "dataset.json")
+    rows, info = [], read_info(Path(folder) / "dataset.json")
     splits = {split: load_dataset(folder, split) for split in SPLITS if split in info["images"]}
     for split, data in splits.items():
         for index in range(len(data)):
@@ -169,6 +163,16 @@ def hold_out(data: Dataset, *, share: float = 0.05) -> tuple[Dataset, Dataset]:
         return data, data
     parts = (data.labels[~held], data.labels[held])
     return tuple(dataclasses.replace(data, labels=part.reset_index(drop=True)) for part in parts)
+
+
+def load_parts(folder: Path | str, split: str = "train", *, also: str = "") -> list[Dataset]:
+    """The data set in ``folder``, and that of the same object of the preset ``also``, where one is named.
+
+    The latter lies beside it: ``…/workspace/cloth`` beside ``…/paper/cloth``. Errors are those of `load_dataset`.
+    """
+    folder = Path(folder)
+    others = [folder.parents[1] / also / folder.name] if also else []
+    return [load_dataset(place, split) for place in (folder, *others)]
 
 
 def join_datasets(first: Dataset, *others: Dataset) -> Dataset:
@@ -244,53 +248,14 @@ def encode_mask(mask: np.ndarray) -> bytes:
 
 def _open_image(path: Path, size: tuple[int, int]) -> Image.Image:
     try:
-        image = Image.open(path)
-        image.load()
-    except (OSError, UnidentifiedImageError, SyntaxError) as error:
-        raise DatasetError(f"{path} is missing, truncated or no image: {error}") from error
+        image = Image.open(path, formats=("WEBP", "PNG"))
+        if image.size == size:  # else nothing is decoded: a small file can hold a huge image
+            image.load()
+    except UNREADABLE_IMAGE as error:
+        raise DatasetError(f"{path} is missing, truncated or no image: {error}: {REMEDY}") from error
     if image.size != size:
         raise DatasetError(f"{path} is {image.size[0]} x {image.size[1]} px, dataset.json says {size[0]} x {size[1]}")
     return image
-
-
-def _read_info(path: Path) -> dict:
-    if not path.is_file():
-        raise FileNotFoundError(f"{path} does not exist: no data set here, or one that is still being rendered")
-    try:
-        info = json.loads(path.read_text())
-    except ValueError as error:
-        raise DatasetError(f"{path} is no JSON: {error}") from error
-    missing = [key for key in REQUIRED_KEYS if key not in info]
-    if missing:
-        raise DatasetError(f"{path} lacks the keys {missing}")
-    if info["format"] != FORMAT:
-        raise DatasetError(f"{path} has format {info['format']!r}, this version reads {FORMAT}")
-    return info
-
-
-def _count_points(info: dict) -> int:
-    return len(info["symmetry"][info["default_group"]][0])
-
-
-def _read_labels(path: Path, info: dict) -> pd.DataFrame:
-    try:
-        labels = pd.read_parquet(path)
-    except (OSError, ValueError) as error:  # pyarrow's errors are among these
-        raise DatasetError(f"{path} is missing, truncated or no Parquet table: {error}") from error
-    missing = [name for name in REQUIRED_COLUMNS if name not in labels]
-    if missing:
-        raise DatasetError(f"{path} lacks the columns {missing}")
-    counts = labels.split.value_counts().to_dict()
-    if counts != info["images"]:
-        raise DatasetError(f"{path} has {counts} rows a split, dataset.json says {info['images']}")
-    points = _count_points(info)
-    for column, length in {"xy": 2 * points, "visible": points, "intrinsics": 9, "camera_pose": 16}.items():
-        wrong = labels.index[labels[column].map(np.size) != length]
-        if len(wrong):
-            raise DatasetError(f"{path}: {column} of row {wrong[0]} is not of length {length}")
-    if not np.isfinite(np.stack(labels.xy.to_list())).all():
-        raise DatasetError(f"{path}: xy holds values that are not finite")
-    return labels
 
 
 def _check_labels_on_mask(data: Dataset, index: int, mask: np.ndarray) -> None:

@@ -12,8 +12,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
+import psutil
 import torch
 from torch import distributed as dist
+
+INTERFACES = ("GLOO_SOCKET_IFNAME", "NCCL_SOCKET_IFNAME")  # what names the network interface to talk over
 
 
 @dataclass(frozen=True)
@@ -63,8 +66,24 @@ def joined(groups: int, device: str) -> Iterator[Team]:
     if size == 1:
         yield team
         return
-    dist.init_process_group("nccl" if place.type == "cuda" else "gloo")
+    with _on_this_machine():
+        dist.init_process_group("nccl" if place.type == "cuda" else "gloo")
+        try:
+            yield team
+        finally:
+            dist.destroy_process_group()
+
+
+@contextmanager
+def _on_this_machine() -> Iterator[None]:
+    """Let processes that all run here listen on the loopback interface alone, where the user names no other."""
+    before = {name: os.environ.get(name) for name in INTERFACES}
+    if os.environ.get("LOCAL_WORLD_SIZE") == os.environ.get("WORLD_SIZE"):
+        addresses = psutil.net_if_addrs().items()
+        loopback = [name for name, known in addresses if any(one.address == "127.0.0.1" for one in known)]
+        os.environ.update({name: loopback[0] for name in INTERFACES if loopback and before[name] is None})
     try:
-        yield team
+        yield
     finally:
-        dist.destroy_process_group()
+        for name in (name for name in INTERFACES if before[name] is None):
+            os.environ.pop(name, None)

@@ -6,7 +6,6 @@ apart; one method has one colour in every figure.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from mmgsd.config import N_POINTS
+from mmgsd.files import writing
 from mmgsd.matching import Match
 
 METHOD_LABELS = {
@@ -44,7 +44,9 @@ CHANCE_STYLES = {"centre": "--", "random": ":"}
 COLUMN_IN, PAGE_IN = 3.5, 7.1  # widths of a column and of a page
 MARK = "#FFE100"  # the asked pixel
 
-_HEAT = colormaps["inferno"](np.linspace(0.3, 1, 256))[:, :3].astype(np.float32)
+HEAT = colormaps["inferno"](np.linspace(0.3, 1, 256))[:, :3].astype(np.float32)  # from cold to hot
+FADED = 0.75  # brightness of an image under a heatmap
+
 _SANS = ["DejaVu Sans"]  # comes with matplotlib: the same letters everywhere
 _STYLE = seaborn.axes_style("ticks") | seaborn.plotting_context("paper") | {
     "font.sans-serif": _SANS, "font.size": 7, "axes.labelsize": 7.5, "axes.titlesize": 7.5, "xtick.labelsize": 7,
@@ -58,14 +60,12 @@ styled = matplotlib.rc_context(_STYLE)
 
 def save_figure(figure: Figure, path: Path, kinds: Sequence[str] = ("pdf", "png")) -> list[Path]:
     """Write ``path`` as PDF without a date (a second run gives the same bytes) and as PNG of 200 dpi; the paths."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     written = []
     for kind in kinds:
         metadata = {"CreationDate": None} if kind == "pdf" else None
-        target, aside = path.with_suffix(f".{kind}"), path.with_suffix(f".{kind}.tmp")
-        with matplotlib.rc_context(_STYLE):
+        target = path.with_suffix(f".{kind}")
+        with matplotlib.rc_context(_STYLE), writing(target) as aside:
             figure.savefig(aside, format=kind, dpi=200, metadata=metadata, bbox_inches="tight", pad_inches=0.01)
-        os.replace(aside, target)
         written.append(target)
     return written
 
@@ -90,7 +90,7 @@ def show_source(axis: Axes, match: Match, index: int) -> None:
 
 def show_answer(axis: Axes, match: Match, index: int, *, modes: bool = True) -> None:
     """Target with heatmap, and the modes with their 1-std ellipses where asked for."""
-    axis.imshow(blend_heatmap(match.image1, match.heatmap[index]))
+    axis.imshow(blend_heatmap(match.image1, match.compute_heatmap(index)))
     axis.autoscale(False)  # a wide ellipse must not shrink the image
     if modes:
         draw_modes(axis, match, index)
@@ -120,11 +120,16 @@ def mark_pixel(axis: Axes, x: float, y: float) -> None:
 
 def blend_heatmap(image: np.ndarray, heatmap: np.ndarray) -> np.ndarray:
     """(H, W, 3) uint8: the faded image under the (H, W) heatmap, which is widened a little so as to be seen."""
-    wide = cv2.GaussianBlur(heatmap.astype(np.float32), (0, 0), 0.008 * heatmap.shape[1])
-    strength = np.nan_to_num(np.sqrt(wide / max(wide.max(), 1e-30)))
-    colours = _HEAT[(255 * strength).astype(np.uint8)]  # (H, W, 3)
+    strength = compute_strength(heatmap)
+    colours = HEAT[(255 * strength).astype(np.uint8)]  # (H, W, 3)
     strength = strength[..., None]
-    return (255 * ((1 - strength) * fade_image(image) * 0.75 + strength * colours)).astype(np.uint8)
+    return (255 * ((1 - strength) * fade_image(image) * FADED + strength * colours)).astype(np.uint8)
+
+
+def compute_strength(heatmap: np.ndarray) -> np.ndarray:
+    """(H, W) float32 in [0, 1], how much of the heat covers the image at each pixel of an (H, W) heatmap."""
+    wide = cv2.GaussianBlur(heatmap.astype(np.float32), (0, 0), 0.008 * heatmap.shape[1])
+    return np.nan_to_num(np.sqrt(wide / max(wide.max(), 1e-30)))
 
 
 def fade_image(image: np.ndarray) -> np.ndarray:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-import json
-import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -16,11 +15,13 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from mmgsd.baselines import BaselineMatcher, list_baselines
-from mmgsd.config import EvaluateConfig, digest
+from mmgsd.config import EvaluateConfig, digest, read_count, read_flag
 from mmgsd.dataset import Dataset, load_dataset, sample_pairs
-from mmgsd.matching import Matcher, read_heatmap
+from mmgsd.dataset_format import UNREADABLE
+from mmgsd.files import DamagedFileError, read_json, saying_what_stays, set_aside, write_json, writing
+from mmgsd.matching import Matcher, check_scales, read_heatmap
 from mmgsd.metrics import aggregate, compute_mahalanobis2, compute_query_errors
-from mmgsd.mixture import Mixture
+from mmgsd.mixture import Mixture, check_modes
 from mmgsd.network import compute_cell_centres
 
 BASELINES = list_baselines()  # hand-made descriptors that this OpenCV has
@@ -42,22 +43,27 @@ def evaluate_model(
 
     The true matches are those of ``group`` ("" is the object's own), whatever the model was taught. As many modes are
     fitted as a query has true matches, but at least ``modes``: of these the most probable ones are the answer.
-    ``temperature`` of the heatmaps is the model's own, calibrated one unless given. ValueError for ``modes`` below 0.
+    ``temperature`` of the heatmaps is the model's own, calibrated one unless given. ValueError for ``modes`` that are
+    not from 0 to `mmgsd.config.MAX_MODES`, for another ``temperature`` than a number above 0, and for weights that
+    were taught another object than the data set shows.
     """
-    if modes < 0:
-        raise ValueError(f"modes must be at least 0, got {modes!r}")
+    overwrite, progress = read_flag("overwrite", overwrite), read_flag("progress", progress)
+    modes, out = read_count("modes", modes), Path(out)
+    if modes:
+        check_modes(modes)
+    check_scales(temperature=temperature)
     data = load_dataset(dataset, "test")
     method = hashlib.sha256(Path(weights).read_bytes()).hexdigest()
     method += "" if temperature is None else f" at temperature {temperature:g}"
     method += f" of {modes} modes" if modes else ""
     question = _describe_question(data, config, group, method)
-    if _is_answered(out, question) and not overwrite:
+    if not overwrite and _is_answered(out, question):
         return out
     matcher = Matcher.load(weights)
     if temperature is not None:
         matcher.temperature = temperature
     answer = _model_answer(matcher, data, config)
-    return _write(_ask(answer, data, config, group, progress, out.stem, modes), out, question)
+    return _answer_all(answer, data, config, group, out, question, progress, modes)
 
 
 def evaluate_baseline(
@@ -67,12 +73,14 @@ def evaluate_baseline(
     """Ask hand-made descriptors, or chance (``centre``, ``random``), the same queries; ValueError for others."""
     if method not in BASELINES + CHANCE:
         raise ValueError(f"method must be one of {BASELINES + CHANCE}, got {method!r}")
+    overwrite, progress = read_flag("overwrite", overwrite), read_flag("progress", progress)
+    out = Path(out)
     data = load_dataset(dataset, "test")
     question = _describe_question(data, config, group, method)
-    if _is_answered(out, question) and not overwrite:
+    if not overwrite and _is_answered(out, question):
         return out
     answer = _chance_answer(method, data) if method in CHANCE else _classical_answer(method, data)
-    return _write(_ask(answer, data, config, group, progress, out.stem), out, question)
+    return _answer_all(answer, data, config, group, out, question, progress)
 
 
 def load_queries(path: Path) -> pd.DataFrame:
@@ -80,8 +88,18 @@ def load_queries(path: Path) -> pd.DataFrame:
 
     pair, image0, image1, point; visible (source), n and hidden (true matches), rmse_px, nearest_px, best_px, swapped,
     pck@…, entropy (nats), outside (share of the heatmap), mahalanobis2 (a list of n).
+    FileNotFoundError, or DamagedFileError, which names the file.
     """
-    return pd.read_parquet(path)
+    try:
+        queries = pd.read_parquet(path, page_checksum_verification=True)
+    except FileNotFoundError:
+        raise
+    except UNREADABLE as error:
+        raise DamagedFileError(f"{path} is damaged or no Parquet table ({error}): use overwrite=True") from error
+    missing = [column for column in ("visible", "rmse_px") if column not in queries]
+    if missing:
+        raise DamagedFileError(f"{path} lacks the columns {missing}: use overwrite=True")
+    return queries
 
 
 def summarise(tables: dict[str, Path]) -> dict[str, dict[str, float]]:
@@ -95,12 +113,26 @@ def summarise(tables: dict[str, Path]) -> dict[str, dict[str, float]]:
 
 
 def write_results(results: dict, path: Path) -> Path:
-    """Write nested results as JSON, aside and then renamed."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_suffix(".tmp")
-    aside.write_text(json.dumps(results, indent=1) + "\n")
-    os.replace(aside, path)
-    return path
+    """Write nested results as JSON, whole or not at all."""
+    return write_json(path, results)
+
+
+def read_results(path: Path, *, depth: int = 1) -> dict[str, Any]:
+    """What `write_results` wrote, {} where there is none: a dictionary of dictionaries, ``depth`` times one in another.
+
+    DamagedFileError where the file says something else: rows that only it holds would be lost if it were written anew.
+    """
+    if not path.is_file():
+        return {}
+    remedy = "restore it (it may be in git), or remove it and lose what no table of answers here gives again"
+    values = read_json(path, remedy=remedy)
+    if not _is_nested(values, depth):
+        raise DamagedFileError(f"{path} holds no table of results: {remedy}")
+    return values
+
+
+def _is_nested(values: Any, depth: int) -> bool:
+    return isinstance(values, dict) and (depth == 0 or all(_is_nested(value, depth - 1) for value in values.values()))
 
 
 def measure_rmse(matcher: Matcher, data: Dataset, *, pairs: int = 60, points: int = 125, seed: int = 0) -> float:
@@ -242,7 +274,10 @@ def _chance_answer(method: str, data: Dataset) -> Answer:
 
 
 def _describe(matcher: Matcher, data: Dataset, indices: np.ndarray, *, batch: int = 16) -> dict[int, Tensor]:
-    """Descriptors (D, h, w) of the images, computed once each."""
+    """Descriptors (C, h, w) of the images, computed once each; ValueError for images of another object."""
+    if matcher.object and matcher.object != data.object:
+        raise ValueError(f"weights must be of the object {data.object!r} of {data.folder}, got weights of "
+                         f"{matcher.object!r}")  # fmt: skip
     return dict(_describe_batches(matcher, data, indices, batch))
 
 
@@ -259,16 +294,22 @@ def _describe_question(data: Dataset, config: EvaluateConfig, group: str, method
 
 
 def _is_answered(out: Path, question: dict[str, str]) -> bool:
+    """Whether a table answers the question; a damaged one is set aside."""
     try:
         return out.is_file() and load_queries(out).attrs == question
-    except (OSError, ValueError):  # truncated or no Parquet: pyarrow's errors are among these
+    except DamagedFileError:
+        set_aside(out)
         return False
 
 
-def _write(table: pd.DataFrame, out: Path, question: dict[str, str]) -> Path:
-    out.parent.mkdir(parents=True, exist_ok=True)
-    aside = out.with_suffix(".tmp")
+def _answer_all(
+    answer: Answer, data: Dataset, config: EvaluateConfig, group: str, out: Path, question: dict[str, str],
+    progress: bool, modes: int = 0,
+) -> Path:  # fmt: skip
+    """Ask every query and write the table of answers, each page of it with a checksum."""
+    with saying_what_stays(lambda: f"stopped: nothing of {out} is kept, tables that are finished are"):
+        table = _ask(answer, data, config, group, progress, out.stem, modes)
     table.attrs = question
-    table.to_parquet(aside, index=False)
-    os.replace(aside, out)
+    with writing(out) as aside:
+        table.to_parquet(aside, index=False, write_page_checksum=True)
     return out

@@ -1,73 +1,62 @@
-"""Two images side by side in a notebook: click or drag in the left one, the right one answers."""
+"""Two images side by side in a notebook: click or drag in the left one, the right one answers.
+
+The browser (`explorer.js`) sends messages, ``{"do": "ask", "xy": [x, y], "pair": 3, "token": "…"}``, and draws two
+traits. ``pair`` holds everything that is seen of a pair of images, and a number that no other pair has. ``answer``
+names the pair it belongs to, and is drawn over no other; it is numbered, so that one equal to the last is sent as
+well. Every message is answered by ``{"token": "…"}`` when it has been dealt with, with an ``error`` where that went
+wrong.
+"""
 
 from __future__ import annotations
 
+import dataclasses
+import json
+import logging
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import anywidget
 import cv2
-import ipywidgets
 import numpy as np
 import traitlets
 
+from mmgsd.__main__ import describe_answer
+from mmgsd.answer import Match
 from mmgsd.baselines import BaselineMatcher
-from mmgsd.dataset import Dataset, sample_pairs
-from mmgsd.drawing import METHOD_LABELS, blend_heatmap, compute_ellipse
-from mmgsd.matching import Match, to_rgb
+from mmgsd.drawing import FADED, HEAT, METHOD_LABELS, compute_ellipse, compute_strength, fade_image
+from mmgsd.explorer_scenes import Scene
+from mmgsd.images import decode_image
 
 QUALITY = 90  # of what the browser is sent, JPEG
-SNAP_PX = 12.0  # a click so near to a material point shows that point's true matches
+DISPLAY_PX = 1600  # longer side of what the browser is sent
+HEAT_PX = 128  # longer side of the heatmap that it is sent, several times as fine as the descriptors
+BASELINE_PX = 640  # longer side of what hand-made descriptors see: their windows are made for images of this size
+SCRIPTS = ("explorer_marks.js", "explorer_picture.js", "explorer.js")  # one module, in this order
+MOST_PINS = 8  # as many as there are colours for
 
-
-@dataclass(frozen=True)
-class Scene:
-    """A pair of images and, where they are known, the labels of the first and the matches in the second."""
-
-    image0: np.ndarray  # (H0, W0, 3) uint8
-    image1: np.ndarray  # (H1, W1, 3) uint8
-    title: str = ""
-    mask1: np.ndarray | None = None  # (H1, W1) bool, which hand-made descriptors need
-    xy0: np.ndarray | None = None  # (P, 2) px of the material points
-    orbits: list[np.ndarray] | None = None  # true matches (n, 2) px of each
-
-    def find_truth(self, xy: np.ndarray) -> np.ndarray:
-        """True matches (n, 2) px of the material point nearest to a pixel (2,); none where it is far or unknown."""
-        if self.xy0 is None:
-            return np.empty((0, 2))
-        apart = np.linalg.norm(self.xy0 - xy, axis=1)
-        return self.orbits[int(apart.argmin())] if apart.min() <= SNAP_PX else np.empty((0, 2))
-
-
-def make_scenes(data: Dataset, *, pairs: int = 50, seed: int = 0) -> list[Callable[[], Scene]]:
-    """Pairs of images of a data set's split, read when they are looked at."""
-    group = data.group()
-
-    def make(first: int, second: int) -> Scene:
-        orbits = [data.xy[second][group.distinct_modes(point)] for point in range(group.n_points)]
-        title = f"{data.object}, images {first} and {second}"
-        images = data.load_image(first), data.load_image(second)
-        seen = np.where(data.visible[first][:, None], data.xy[first], np.inf)
-        return Scene(*images, title, data.load_mask(second), seen, orbits)
-
-    chosen = sample_pairs(data.episode, pairs, np.random.default_rng(seed), present=data.present)
-    return [lambda a=int(a), b=int(b): make(a, b) for a, b in chosen]
+log = logging.getLogger(__name__)
 
 
 class Pictures(anywidget.AnyWidget):
-    """The two pictures in the browser (`explorer.js`), which sends ``{"xy": [x, y]}`` and awaits an ``answered``."""
+    """The explorer in the browser: everything that is seen of it."""
 
-    _esm = Path(__file__).with_name("explorer.js")
-    image0 = traitlets.Bytes().tag(sync=True)  # JPEG
-    image1 = traitlets.Bytes().tag(sync=True)  # JPEG
-    marks = traitlets.Dict().tag(sync=True)  # xy, modes, matches in px; set last, it has the browser draw
+    _esm = "\n".join(Path(__file__).with_name(name).read_text("utf-8") for name in SCRIPTS)
+    _css = Path(__file__).with_name("explorer.css")
+    pair = traitlets.Dict().tag(sync=True)  # id, number, count, names, sizes; JPEG image0, image1, faded1; truth
+    answer = traitlets.Dict().tag(sync=True)  # pair, number, milliseconds, json, points, heat, heat_size
+    methods = traitlets.List().tag(sync=True)  # [name, label] of each
+    method = traitlets.Unicode().tag(sync=True)
+    heat_colours = traitlets.Bytes((255 * HEAT).astype(np.uint8).tobytes()).tag(sync=True)  # 256 times R, G, B
+
+    def __repr__(self) -> str:
+        """What stands in a notebook where no widget can be shown."""
+        return "the explorer (run this cell to see it)"
 
 
 class Explorer:
-    """The two pictures and their buttons; ``show()`` them in a notebook.
+    """The two pictures with everything around them; ``show()`` them in a notebook.
 
     ``matchers`` {name: `Matcher` or `BaselineMatcher`}; ``scenes`` are pairs of images, or functions that load one.
     Click or drag in the left image; ``ask(x, y)`` does the same from code.
@@ -76,115 +65,205 @@ class Explorer:
     def __init__(self, matchers: Mapping[str, Any], scenes: list) -> None:
         if not matchers or not scenes:
             raise ValueError("matchers and scenes must not be empty")
-        self.matchers, self.scenes, self.index = dict(matchers), list(scenes), 0
-        self.xy, self.answer, self.milliseconds = None, None, 0.0
-        labels = [(METHOD_LABELS.get(name, name), name) for name in self.matchers]
-        self.method = ipywidgets.Dropdown(options=labels, description="method")
-        self.parts = {name: ipywidgets.ToggleButton(value=True, description=name, layout={"width": "9em"})
-                      for name in ("heatmap", "modes", "true matches")}  # fmt: skip
-        self.steps = {name: ipywidgets.Button(description=name, layout={"width": "7em"})
-                      for name in ("previous", "random", "next")}  # fmt: skip
-        self.pictures, self.title, self.line = Pictures(), ipywidgets.HTML(), ipywidgets.HTML()
-        self._connect()
+        self.matchers, self.scenes, self.pairs_opened, self.answers = dict(matchers), list(scenes), 0, 0
+        self.rng, self._own, self._parts = np.random.default_rng(), None, {}
+        methods = [[name, METHOD_LABELS.get(name, name)] for name in self.matchers]
+        self.pictures = Pictures(methods=methods, method=methods[0][0])
+        self.pictures.on_msg(self._on_message)
         self.open(0)
 
-    def show(self) -> ipywidgets.Widget:
+    def show(self) -> Pictures:
         """The widget to put on the page."""
-        buttons = ipywidgets.HBox([self.method, *self.parts.values(), *self.steps.values()])
-        return ipywidgets.VBox([buttons, self.title, self.pictures, self.line])
+        return self.pictures
 
     def open(self, index: int) -> None:
-        """Show one of the pairs."""
-        self.index = index % len(self.scenes)
-        scene = self.scenes[self.index]
+        """Show one of the pairs; where it cannot be read, the last one stays."""
+        index %= len(self.scenes)
+        scene = self.scenes[index]
         self.scene = scene() if callable(scene) else scene
-        self.xy, self.answer, self._prepared = None, None, {}
-        self.title.value = self.scene.title
-        self.line.value = "Click or drag in the left image."
-        self.pictures.image0 = _encode(self.scene.image0)
-        self._draw()
+        self.index, self.xy, self.pins, self.answer, self._prepared = index, None, [], None, {}
+        self.pairs_opened += 1
+        place = {"id": self.pairs_opened, "number": index + 1, "count": len(self.scenes)}
+        self.pictures.pair = place | show_scene(self.scene)
 
-    def ask(self, x: float, y: float) -> Match:
-        """Answer for the pixel and draw it."""
-        start = time.perf_counter()
-        self.xy = np.array([x, y], float)
-        self.answer = self._get_answering()(self.xy[None])
-        self._draw()
+    def ask(self, x: float, y: float, *, pin: bool = False) -> Match:
+        """Answer for the pixel, and for those pinned before it, and draw it all; ``pin`` has this one stay as well."""
+        pins, xy = list(self.pins), (float(x), float(y))
+        if pin and len(pins) == MOST_PINS:
+            raise ValueError(f"{MOST_PINS} points are pinned, and there are no colours for more: clear them first")
+        answer = self._answer([*pins, xy])
+        self.pins, self.xy = (pins + [xy], None) if pin else (pins, xy)
+        return answer
+
+    @property
+    def method(self) -> str:
+        """The name of the matcher that answers; setting it answers anew, and leaves all as it was where that fails."""
+        return self.pictures.method
+
+    @method.setter
+    def method(self, name: str) -> None:
+        if name not in self.matchers:
+            raise ValueError(f"method must be one of {', '.join(map(repr, self.matchers))}, got {name!r}")
+        before, self.pictures.method = self.pictures.method, name
+        try:
+            self._answer(self.points)
+        except Exception:
+            self.pictures.method = before
+            raise
+
+    @property
+    def points(self) -> list[tuple[float, float]]:
+        """The pixels that are asked about: the pinned ones first."""
+        return [*self.pins, *([] if self.xy is None else [self.xy])]
+
+    def clear(self) -> None:
+        """Forget every pixel that was asked about."""
+        self.pins, self.xy = [], None
+        self._answer([])
+
+    def open_own(self, side: int, image: np.ndarray, name: str) -> None:
+        """Show the user's image as the left (0) or right (1) one beside what is there; a pair after all others."""
+        scene = self.scene.replace_image(side, image, name)
+        if self._own is None:
+            self._own = len(self.scenes)
+            self.scenes.append(scene)
+        self.scenes[self._own] = scene
+        self.open(self._own)
+
+    def _answer(self, points: list[tuple[float, float]]) -> Match | None:
+        """Have the chosen method answer for all points, and the browser draw what it says."""
+        start, match = time.perf_counter(), None
+        if points:
+            match = self._get_answering()(np.array(points))
+        shown = {"json": "[]", "points": []} if match is None else show_answer(match, self.scene)
         self.milliseconds = 1000 * (time.perf_counter() - start)
-        self.line.value = self._describe()
-        return self.answer
+        self.answers += 1
+        about = {"pair": self.pairs_opened, "number": self.answers, "milliseconds": round(self.milliseconds)}
+        self.answer, self.pictures.answer = match, about | shown
+        return match
 
     def _get_answering(self) -> Callable[[np.ndarray], Match]:
         """The chosen method, its descriptors of this pair computed once."""
-        name = self.method.value
+        name = self.method
         if name not in self._prepared:
             matcher, scene = self.matchers[name], self.scene
-            if isinstance(matcher, BaselineMatcher):
-                mask = np.ones(scene.image1.shape[:2], bool) if scene.mask1 is None else scene.mask1
-                self._prepared[name] = lambda xy: matcher.match(scene.image0, scene.image1, xy, mask1=mask)
-            else:
-                self._prepared[name] = matcher.prepare(scene.image0, scene.image1).match
+            baseline = isinstance(matcher, BaselineMatcher)
+            self._prepared[name] = (
+                prepare_baseline(matcher, scene) if baseline else matcher.prepare(scene.image0, scene.image1).match
+            )
         return self._prepared[name]
 
-    def _draw(self) -> None:
-        """Send the right picture and the marks in one message."""
-        image, marks = self.scene.image1, {"xy": None, "modes": [], "matches": []}
-        if self.answer is not None:
-            marks["xy"] = self.xy.tolist()
-            if self.parts["heatmap"].value:
-                image = blend_heatmap(image, self.answer.heatmap[0])
-            if self.parts["modes"].value:
-                marks["modes"] = describe_modes(self.answer)
-            if self.parts["true matches"].value:
-                marks["matches"] = self.scene.find_truth(self.xy).tolist()
-        with self.pictures.hold_sync():
-            self.pictures.image1 = _encode(image)
-            self.pictures.marks = marks
-
-    def _describe(self) -> str:
-        best, answer = self.answer.best(), self.answer
-        return (
-            f"pixel ({self.xy[0]:.0f}, {self.xy[1]:.0f}) · entropy {answer.entropy[0]:.1f} nats · outside the modes "
-            f"{100 * answer.outside[0]:.0f} % · narrowest mode at ({best.xy[0, 0]:.0f}, {best.xy[0, 1]:.0f}), "
-            f"±{best.spread_px[0]:.0f} px · {self.milliseconds:.0f} ms"
-        )
-
-    def _connect(self) -> None:
-        self.pictures.on_msg(self._on_message)
-        for widget in (self.method, *self.parts.values()):
-            widget.observe(self._on_change, "value")
-        rng = np.random.default_rng()
-        self.steps["previous"].on_click(lambda _: self.open(self.index - 1))
-        self.steps["next"].on_click(lambda _: self.open(self.index + 1))
-        self.steps["random"].on_click(lambda _: self.open(int(rng.integers(len(self.scenes)))))
-
     def _on_message(self, _: Pictures, content: dict, buffers: list) -> None:
+        """Do what the browser asks for; it hears of every end, and the reader of every error, in a sentence."""
+        told = {"token": content.get("token")}
         try:
-            self.ask(*content["xy"])
-        finally:  # the browser asks on
-            self.pictures.send({"answered": content["xy"]})
+            self._handle(content, buffers)
+        except (ValueError, OSError) as error:
+            told["error"] = _to_sentence(error)
+        except Exception as error:
+            log.exception("the explorer could not do %s", content.get("do"))
+            told["error"] = f"{type(error).__name__}: {_to_sentence(error)}"
+        self.pictures.send(told)
 
-    def _on_change(self, change: dict) -> None:
-        if self.xy is not None:
-            self.ask(*self.xy)
+    def _handle(self, content: dict, buffers: list) -> None:
+        do = content.get("do")
+        if do == "ask":
+            if content["pair"] == self.pairs_opened:  # else it was asked about a pair that is gone
+                self.ask(*content["xy"], pin=bool(content.get("pin")))
+        elif do == "step":
+            self._step(content["to"])
+        elif do == "method":
+            self.method = content["name"]
+        elif do == "clear":
+            self.clear()
+        elif do == "file":
+            self._receive(content, buffers)
+        else:
+            raise ValueError(f"do must be ask, step, method, clear or file, got {do!r}")
+
+    def _step(self, to: str) -> None:
+        count = len(self.scenes)
+        other = int(self.rng.integers(1, count)) if count > 1 else 0  # never the same pair again
+        self.open(self.index + {"previous": -1, "next": 1, "random": other}[to])
+
+    def _receive(self, content: dict, buffers: list) -> None:
+        """A part of a file; with the last one, the image is shown."""
+        side, name = int(content["side"]), str(content["name"])
+        parts = [] if content["part"] == 0 else self._parts.pop(side, [])
+        parts.append(bytes(buffers[0]))
+        if len(parts) < content["parts"]:
+            self._parts[side] = parts
+        else:
+            self.open_own(side, decode_image(b"".join(parts), name), name)
 
 
-def describe_modes(match: Match) -> list[dict[str, Any]]:
-    """The first query's modes: ``x``, ``y``, the 1-std ellipse's ``radii`` in px and ``angle`` in rad, ``weight``."""
-    modes = []
-    for (x, y), weight, covariance in zip(match.modes[0], match.weights[0], match.covariances[0], strict=True):
-        if np.isfinite(x):
-            radii, angle = compute_ellipse(covariance)
-            place = {"x": float(x), "y": float(y), "weight": float(weight)}
-            modes.append({**place, "radii": radii.tolist(), "angle": float(angle)})
-    return modes
+def show_scene(scene: Scene) -> dict[str, Any]:
+    """What the browser is told of a pair of images; they are made smaller for it, their sizes are the true ones."""
+    image0, image1 = (_shrink(image, DISPLAY_PX) for image in (scene.image0, scene.image1))
+    faded = (255 * FADED * fade_image(image1)[..., 0]).astype(np.uint8)
+    sizes = [[image.shape[1], image.shape[0]] for image in (scene.image0, scene.image1)]
+    pictures = {"image0": _encode(image0[..., ::-1]), "image1": _encode(image1[..., ::-1]), "faded1": _encode(faded)}
+    return pictures | {"names": [scene.name0, scene.name1], "sizes": sizes, "truth": scene.xy0 is not None}
+
+
+def show_answer(match: Match, scene: Scene) -> dict[str, Any]:
+    """What the browser is told of an answer: ``json`` as of ``python -m mmgsd match --json``, and what is drawn.
+
+    ``points`` {ellipses, matches} of each query, see `describe_ellipses`, px; ``heat`` of the last one, 0 to 255.
+    """
+    height, width = scene.image1.shape[:2]
+    scale = HEAT_PX / max(width, height)
+    size = (max(1, round(width * scale)), max(1, round(height * scale)))
+    heat = compute_strength(cv2.resize(match.cells[-1].astype(np.float32), size, interpolation=cv2.INTER_LINEAR))
+    ellipses = (describe_ellipses(match, query) for query in range(len(match.xy)))
+    truth = (scene.find_truth(xy).tolist() for xy in match.xy)
+    points = [{"ellipses": shapes, "matches": true} for shapes, true in zip(ellipses, truth, strict=True)]
+    shown = {"heat": np.rint(255 * heat).astype(np.uint8).tobytes(), "heat_size": list(size)}
+    return shown | {"json": json.dumps(describe_answer(match)), "points": points}
+
+
+def describe_ellipses(match: Match, query: int = 0) -> list[dict[str, float]]:
+    """A query's modes that are there: ``x``, ``y``, ``major`` and ``minor`` radius of 1 std in px, ``angle`` in rad."""
+    described = []
+    for k in np.flatnonzero(match.weights[query] > 0):
+        (x, y), (radii, angle) = match.modes[query, k].tolist(), compute_ellipse(match.covariances[query, k])
+        described.append({"x": x, "y": y, "major": float(radii[0]), "minor": float(radii[1]), "angle": float(angle)})
+    return described
+
+
+def prepare_baseline(matcher: BaselineMatcher, scene: Scene) -> Callable[[np.ndarray], Match]:
+    """Answers of hand-made descriptors, which see large images made smaller; pixels (S, 2) are those of the large."""
+    small = [_shrink(image, BASELINE_PX) for image in (scene.image0, scene.image1)]
+    size = (small[1].shape[1], small[1].shape[0])
+    mask = None if scene.mask1 is None else cv2.resize(scene.mask1.astype(np.uint8), size, interpolation=0).astype(bool)
+    ratio0, ratio1 = (
+        np.divide(image.shape[1::-1], less.shape[1::-1])
+        for image, less in zip((scene.image0, scene.image1), small, strict=True)
+    )
+
+    def answer(xy: np.ndarray) -> Match:
+        found = matcher.match(*small, (xy + 0.5) / ratio0 - 0.5, mask1=mask)
+        back = {
+            "modes": (found.modes + 0.5) * ratio1 - 0.5,
+            "covariances": found.covariances * np.outer(ratio1, ratio1),
+            "entropy": found.entropy + np.log(ratio1.prod()),
+        }
+        return dataclasses.replace(found, image0=scene.image0, image1=scene.image1, xy=xy, **back)
+
+    return answer
+
+
+def _shrink(image: np.ndarray, longest: int) -> np.ndarray:
+    """The image, or a smaller one where its longer side exceeds ``longest``."""
+    scale = longest / max(image.shape[:2])
+    size = (max(1, round(scale * image.shape[1])), max(1, round(scale * image.shape[0])))
+    return image if scale >= 1 else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
 def _encode(image: np.ndarray) -> bytes:
-    bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
-    return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()
+    """JPEG of a grey or BGR image."""
+    return cv2.imencode(".jpg", np.ascontiguousarray(image), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()
 
 
-def make_own_scene(image0: np.ndarray, image1: np.ndarray) -> Scene:
-    """A scene of a user's own images, of any kind that `Matcher.match` takes."""
-    return Scene(to_rgb(image0, "image0"), to_rgb(image1, "image1"), "your images")
+def _to_sentence(error: Exception) -> str:
+    return " ".join(str(error).split())[:400] or type(error).__name__

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,15 +13,17 @@ import cv2
 import numpy as np
 import pandas as pd
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
+from safetensors.numpy import save
 
 from mmgsd.dataset import Dataset
+from mmgsd.files import DamagedFileError, write_bytes
 from mmgsd.matching import Match, Matcher
 from mmgsd.metrics import ErrorSummary, summarise_errors
 from mmgsd.plots import compute_object_size
 
 QUALITY = 90  # of the example's images, JPEG
 _SUMMARY = ("mean_px", "histogram")  # and asked, which all methods share
+_IMAGES = ("image0", "image1")
 _ANSWER = ("modes", "weights", "covariances", "entropy", "outside", "cells")
 
 
@@ -85,7 +86,7 @@ def save_figure_data(data: FigureData, path: Path) -> Path:
     """Write a safetensors file; ValueError where the methods did not answer the same queries."""
     asked, example = _first(data.errors).asked, _first(data.answers)
     tensors = {"asked": asked, "true": data.true}
-    for name in ("image0", "image1"):
+    for name in _IMAGES:
         image = cv2.cvtColor(getattr(example, name), cv2.COLOR_RGB2BGR)
         tensors[name] = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1]
     for method, summary in data.errors.items():
@@ -96,11 +97,8 @@ def save_figure_data(data: FigureData, path: Path) -> Path:
     for method, match in data.answers.items():
         tensors |= {f"{method}/{name}": np.asarray(getattr(match, name), np.float32) for name in _ANSWER}
     note = {"methods": list(data.errors), "models": list(data.answers), "object_size_px": data.object_size_px}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_suffix(".tmp")
-    save_file({n: np.ascontiguousarray(t) for n, t in tensors.items()}, aside, {"figures": json.dumps(note)})
-    os.replace(aside, path)
-    return path
+    packed = save({n: np.ascontiguousarray(t) for n, t in tensors.items()}, {"figures": json.dumps(note)})
+    return write_bytes(path, packed)
 
 
 def load_figure_data(path: Path) -> FigureData:
@@ -113,9 +111,10 @@ def load_figure_data(path: Path) -> FigureData:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         summaries = {m: [tensors[f"errors/{m}/{name}"] for name in _SUMMARY] for m in note["methods"]}
         errors = {m: ErrorSummary(tensors["asked"], *summary) for m, summary in summaries.items()}
-    except (SafetensorError, KeyError, TypeError) as error:
-        raise ValueError(f"{path} does not hold the data of figures: {error}") from error
-    images = (cv2.cvtColor(cv2.imdecode(tensors[n], cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB) for n in ("image0", "image1"))
-    shared = dict(zip(("image0", "image1"), images, strict=True), xy=tensors["xy"])
-    answers = {m: Match(**shared, **{n: tensors[f"{m}/{n}"] for n in _ANSWER}) for m in note["models"]}
-    return FigureData(errors, note["object_size_px"], answers, tensors["true"])
+        images = {n: cv2.cvtColor(cv2.imdecode(tensors[n], cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB) for n in _IMAGES}
+        shared = {**images, "xy": tensors["xy"]}
+        answers = {m: Match(**shared, **{n: tensors[f"{m}/{n}"] for n in _ANSWER}) for m in note["models"]}
+        return FigureData(errors, float(note["object_size_px"]), answers, tensors["true"])
+    except (SafetensorError, OSError, KeyError, TypeError, ValueError, AttributeError, cv2.error) as error:
+        remedy = "restore it (it may be in git), or run notebooks/04_evaluate.ipynb for this preset"
+        raise DamagedFileError(f"{path} does not hold the data of figures ({error}): {remedy}") from error

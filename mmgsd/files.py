@@ -13,10 +13,11 @@ import shutil
 import socket
 import time
 import uuid
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 try:
     import fcntl
@@ -105,6 +106,7 @@ def set_aside(path: Path) -> Path:
     """Rename a damaged intermediate file so that it is made again; returns where it is now."""
     target = path.with_name(f"{path.name}.damaged")
     os.replace(path, target)
+    warnings.warn(f"{path} is damaged, so it is made again; what it held is now {target}", stacklevel=2)
     return target
 
 
@@ -126,6 +128,8 @@ def remove_folder(folder: Path, is_ours: Callable[[Path], bool]) -> None:
 def replace_folder(finished: Path, folder: Path, is_ours: Callable[[Path], bool]) -> None:
     """Put the folder ``finished`` in the place of ``folder``, whose files must all be ours (see `remove_folder`)."""
     old = None
+    if hasattr(os, "sync"):
+        os.sync()  # thousands of small files: one call for all of them
     if folder.exists():
         check_ours(folder, is_ours)
         old = name_aside(folder, "old")
@@ -150,25 +154,58 @@ def check_ours(folder: Path, is_ours: Callable[[Path], bool]) -> None:
 def locked(folder: Path, doing: str) -> Iterator[None]:
     """Hold a folder, which need not exist, for this process alone; LockedError names who holds it, and ``doing`` what.
 
-    The lock ends with the process, however it ends. It lies beside the folder: ``.NAME.lock``.
+    The lock ends with the process, however it ends. It lies beside the folder while it is held: ``.NAME.lock``.
     """
     folder.parent.mkdir(parents=True, exist_ok=True)
     path = folder.with_name(f".{folder.name}.lock")
-    with open(path, "a+") as file:
-        try:
-            if fcntl:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            file.seek(0)
-            raise LockedError(f"{folder} is in use by {file.read().strip() or 'another process'}: wait for it, "
-                              "or stop it") from None  # fmt: skip
+    with _take(path) as file:
+        if file is None:
+            holder = path.read_text().strip() if path.is_file() else ""
+            raise LockedError(f"{folder} is in use by {holder or 'another process'}: wait for it, or stop it")
         file.truncate(0)
         file.write(f"process {os.getpid()} on {socket.gethostname()}, {doing} since {time.strftime('%F %T')}\n")
         file.flush()
         try:
             yield
         finally:
-            file.truncate(0)
+            path.unlink(missing_ok=True)
+
+
+@contextmanager
+def _take(path: Path) -> Iterator[TextIO | None]:
+    """The lock file, held, or None where another process holds it; one that was removed meanwhile is opened anew."""
+    while True:
+        with open(path, "a+") as file:
+            try:
+                if fcntl:
+                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                yield None
+                return
+            if not fcntl or (path.exists() and os.fstat(file.fileno()).st_ino == path.stat().st_ino):
+                yield file
+                return
+
+
+@contextmanager
+def scratch_folder(parent: Path, name: str) -> Iterator[Path]:
+    """A temporary folder in ``parent``, removed at the end; those of its name that killed processes left go first."""
+    remove_leftovers(parent, name)
+    folder = name_aside(parent / name)
+    folder.mkdir()
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextmanager
+def saying_what_stays(describe: Callable[[], str]) -> Iterator[None]:
+    """Let the KeyboardInterrupt of a Ctrl-C, or of a notebook's stop, say what is kept of the work."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(describe()) from None
 
 
 def _is_running(host: str, pid: int) -> bool:

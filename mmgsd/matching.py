@@ -2,32 +2,28 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
+import math
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import torch
-from PIL import Image, ImageOps, UnidentifiedImageError
-from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from mmgsd.config import CONTRASTIVE, ROUNDNESS, TrainConfig, find_root, from_dict
+from mmgsd.answer import Best as Best
+from mmgsd.answer import Match
+from mmgsd.config import CONTRASTIVE, ROUNDNESS, TrainConfig, find_root
+from mmgsd.images import check_aspect, check_pixels, to_rgb
+from mmgsd.images import read_image as read_image
 from mmgsd.losses import compute_squared_distances
-from mmgsd.mixture import Mixture, fit_modes
-from mmgsd.network import (
-    build_network,
-    compute_cell_centres,
-    compute_input_size,
-    find_device,
-    sample_descriptors,
-)
+from mmgsd.mixture import Mixture, check_count, check_modes, fit_modes, keep_most_probable
+from mmgsd.network import compute_cell_centres, find_device, fit_input_size, sample_descriptors
+from mmgsd.weights import read_weights
 
 QUARTERS = 4  # turns of an image whose descriptors are averaged: what noise they have differs
-RADIUS_PX = 20.0  # within which a robot's grasp still holds, unless the caller says otherwise
+SIZES_PX = (16, 65536)  # of the images that a model was taught with
 
 
 def compute_heatmap(squared_distances: Tensor, *, bandwidth: float | None = None, temperature: float = 1.0) -> Tensor:
@@ -35,8 +31,9 @@ def compute_heatmap(squared_distances: Tensor, *, bandwidth: float | None = None
 
     softmax(-d²) as in training (paper section "Symmetric Distributional Loss"); or, for descriptors of a contrastive
     loss, which have no scale of their own, a Gaussian of ``bandwidth`` in the descriptor norm differences, normalised.
-    Either is raised to the power 1 / ``temperature``.
+    Either is raised to the power 1 / ``temperature``. ValueError where one of the two is not finite and above 0.
     """
+    check_scales(bandwidth=bandwidth, temperature=temperature)
     scale = 1.0 if bandwidth is None else 1 / (2 * bandwidth**2)
     return torch.softmax(-scale / temperature * squared_distances, -1)
 
@@ -46,89 +43,32 @@ def compute_entropy(heatmap: Tensor, cell_area: float) -> Tensor:
     return torch.special.entr(heatmap).sum(-1) + float(np.log(cell_area))
 
 
-@dataclass(frozen=True)
-class Best:
-    """The one mode of each of S queries to act on; NaN where the answer is not sure enough."""
-
-    xy: np.ndarray  # (S, 2) px in image1
-    spread_px: np.ndarray  # (S,) std of the mode, root mean square over directions
-    confidence: np.ndarray  # (S,) in [0, 1]
-
-
-@dataclass(frozen=True)
-class Match:
-    """The answer to S queries; pixels are those of the caller's images."""
-
-    image0: np.ndarray  # (H0, W0, 3) uint8
-    image1: np.ndarray  # (H1, W1, 3) uint8
-    xy: np.ndarray  # (S, 2) px in image0
-    modes: np.ndarray  # (S, n, 2) px in image1, most probable first
-    weights: np.ndarray  # (S, n), sum to 1
-    covariances: np.ndarray  # (S, n, 2, 2) px²
-    entropy: np.ndarray  # (S,) nats, of the density over px
-    outside: np.ndarray  # (S,) heatmap mass outside every mode's 95 % ellipse, in [0, 1]
-    cells: np.ndarray  # (S, h, w) heatmap on the descriptors' grid, sums to 1
-
-    @cached_property
-    def heatmap(self) -> np.ndarray:
-        """(S, H1, W1) float32, the heatmap over image1's pixels; sums to 1."""
-        size = (self.image1.shape[1], self.image1.shape[0])
-        full = np.empty((len(self.cells), *self.image1.shape[:2]), np.float32)
-        for cells, pixels in zip(self.cells, full, strict=True):
-            cv2.resize(cells, size, dst=pixels, interpolation=cv2.INTER_LINEAR)
-        return full / full.sum((1, 2), keepdims=True)
-
-    @property
-    def spread_px(self) -> np.ndarray:
-        """(S, n) std of each mode, root mean square over directions; NaN for absent modes."""
-        return np.sqrt(np.trace(self.covariances, axis1=-2, axis2=-1) / 2)
-
-    def confidence(self, *, radius_px: float = RADIUS_PX) -> np.ndarray:
-        """(S, n) in [0, 1], probability that a true match lies within ``radius_px`` of each mode.
-
-        That of a round Gaussian as wide as the mode, less what the mode's weight lacks of an equal share.
-        """
-        if not radius_px > 0:
-            raise ValueError(f"radius_px must be greater than 0 px, got {radius_px!r}")
-        present = (self.weights > 0).sum(1, keepdims=True)
-        near = -np.expm1(-0.5 * np.square(radius_px / self.spread_px))
-        return np.minimum(1, present * self.weights) * np.nan_to_num(near)
-
-    def best(self, *, min_confidence: float = 0.0, radius_px: float = RADIUS_PX) -> Best:
-        """The mode with the least spread of each query: which of the like places to grasp (paper introduction).
-
-        Abstains, with NaN for ``xy``, where a true match lies within ``radius_px`` with less than ``min_confidence``.
-        """
-        if not 0 <= min_confidence <= 1:
-            raise ValueError(f"min_confidence must be in [0, 1], got {min_confidence!r}")
-        rows = np.arange(len(self.modes))
-        chosen = np.nan_to_num(self.spread_px, nan=np.inf).argmin(1)
-        confidence = self.confidence(radius_px=radius_px)[rows, chosen]
-        xy = np.where((confidence >= min_confidence)[:, None], self.modes[rows, chosen], np.nan)
-        return Best(xy, self.spread_px[rows, chosen], confidence)
-
-    def __getitem__(self, index: int) -> Match:
-        """The answer to one query alone."""
-        names = ("xy", "modes", "weights", "covariances", "entropy", "outside", "cells")
-        return dataclasses.replace(self, **{name: getattr(self, name)[index][None] for name in names})
-
-    def plot(self, index: int = 0):  # noqa: ANN201 (matplotlib is imported only where a plot is asked for)
-        """Figure of source pixel, heatmap and modes with their 1-std ellipses, for one query."""
-        from mmgsd.plots import plot_match
-
-        return plot_match(self, index)
+def check_scales(*, bandwidth: float | None = None, temperature: float = 1.0) -> None:
+    """ValueError, which names it, for a ``bandwidth`` or a ``temperature`` that is not finite and greater than 0."""
+    for name, value in (("bandwidth", bandwidth), ("temperature", temperature)):
+        number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+        if value is not None and not (number and math.isfinite(value) and value > 0):
+            raise ValueError(f"{name} must be finite and greater than 0, got {value!r}")
 
 
 class Matcher:
-    """Finds all matches of pixels between two images of an object, with trained weights."""
+    """Finds all matches of pixels between two images of an object, with trained weights.
+
+    ``modes`` of its symmetry, and the ``size`` (width, height) px of the images it was taught with. ValueError for what
+    cannot be.
+    """
 
     def __init__(
         self, network: torch.nn.Module, config: TrainConfig, *, modes: int, size: tuple[int, int], device: str = "",
         bandwidth: float | None = None, temperature: float = 1.0,
     ) -> None:  # fmt: skip
+        check_scales(bandwidth=bandwidth, temperature=temperature)
+        check_modes(modes)
+        _check_size(size)
         self.device = torch.device(device or find_device())
         self.network = network.eval().to(self.device, memory_format=torch.channels_last)
         self.config, self.modes, self.size = config, modes, size
+        self.object = config.object  # "" where a file of weights does not say
         self.temperature = temperature
         self.turns = QUARTERS if config.rotate else 1  # what was trained upright knows only upright images
         self.bandwidth = config.margin / 4 if bandwidth is None and config.method in CONTRASTIVE else bandwidth
@@ -136,37 +76,41 @@ class Matcher:
     @classmethod
     def load(cls, path: Path | str, *, device: str = "") -> Matcher:
         """Weights from a safetensors file; FileNotFoundError, or ValueError for one that is damaged or not ours."""
-        if not Path(path).is_file():
-            raise FileNotFoundError(f"{path} does not exist: train a model, or give the path of its weights")
+        weights = read_weights(path)
         try:
-            with safe_open(path, "pt") as file:
-                metadata = file.metadata() or {}
-                state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        except (SafetensorError, OSError) as error:
-            raise ValueError(f"{path} is truncated or no safetensors file: {error}") from error
-        if metadata.get("format") != "mmgsd-1":
-            raise ValueError(f"{path} holds no mmgsd weights: its metadata says format {metadata.get('format')!r}")
-        config = from_dict(TrainConfig, json.loads(metadata["config"]))
-        network = build_network(
-            config.network, config.descriptor_dim, roles=config.roles, heads=config.heads, pretrained=False
-        )
-        try:
-            network.load_state_dict({name: value.float() for name, value in state.items()})
-        except RuntimeError as error:
-            raise ValueError(f"{path} does not fit the network {config.network!r}: {error}") from error
-        size = tuple(json.loads(metadata["size"]))
-        scales = {name: float(metadata[name]) for name in ("bandwidth", "temperature") if name in metadata}
-        return cls(network, config, modes=int(metadata["modes"]), size=size, device=device, **scales)
+            matcher = cls(weights.network, weights.config, device=device, **weights.settings)
+        except ValueError as error:
+            raise ValueError(f"{path}: of its metadata, {error}: get the file anew") from error
+        matcher.object = weights.object
+        return matcher
 
     @torch.inference_mode()
-    def describe(self, images: list[np.ndarray]) -> Tensor:
-        """Descriptors (B, C, h, w) of B images (H, W, 3) uint8 of any sizes, the mean over quarter turns.
+    def describe(self, images: list[np.ndarray]) -> list[Tensor]:
+        """Descriptors (C, h, w) of each of the images (H, W, 3) uint8 of any sizes, the mean over quarter turns.
 
-        C is D, or 2 D where an image is described in both roles: as a source first, then as a target.
+        C is D, or 2 D where an image is described in both roles: as a source first, then as a target. The grid follows
+        the image's own aspect (`fit_input_size`); images of one grid are described at once.
         """
-        size = compute_input_size(self.size, self.config.input_px)
-        small = np.stack([cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in images])
-        batch = torch.from_numpy(small).to(self.device).permute(0, 3, 1, 2).float() / 255
+        sizes = [self.compute_input_size(image) for image in images]
+        described = {}
+        for size in dict.fromkeys(sizes):
+            chosen = [index for index, other in enumerate(sizes) if other == size]
+            small = [cv2.resize(images[index], size, interpolation=cv2.INTER_AREA) for index in chosen]
+            batch = torch.from_numpy(np.stack(small)).to(self.device).permute(0, 3, 1, 2).float() / 255
+            described |= zip(chosen, self.describe_inputs(batch), strict=True)
+        return [described[index] for index in range(len(images))]
+
+    def compute_input_size(self, image: np.ndarray, name: str = "image") -> tuple[int, int]:
+        """(width, height) px that an image (H, W, 3) is given to the network with; ValueError for a narrow strip."""
+        size = (image.shape[1], image.shape[0])
+        if size[0] * self.size[1] != size[1] * self.size[0]:  # what the model was taught with may be a strip
+            check_aspect(size, name)
+        # px: where a level is less than 3 cells across, bfloat16's strided convolution on a CPU reads memory at random
+        least = 12 * self.network.stride
+        return fit_input_size(size, self.size, self.config.input_px, least_px=least)
+
+    def describe_inputs(self, batch: Tensor) -> Tensor:
+        """Descriptors (B, C, h, w) of images (B, 3, H, W) in [0, 1] of the network's input size."""
         return sum(self._describe_turned(batch, k) for k in range(self.turns)) / self.turns
 
     def _describe_turned(self, batch: Tensor, quarters: int) -> Tensor:
@@ -184,41 +128,43 @@ class Matcher:
         return heatmap.view(len(xy), *descriptors1.shape[1:])
 
     @torch.inference_mode()
-    def match(
-        self, image0: np.ndarray, image1: np.ndarray, xy: np.ndarray | list, *, n: int | str | None = None
-    ) -> Match:
-        """All matches in ``image1`` of the pixels ``xy`` (S, 2) of ``image0``.
+    def match(self, image0: np.ndarray, image1: np.ndarray, xy: Any, *, n: Any = None) -> Match:
+        """All matches in ``image1`` of the pixels ``xy`` (S, 2), or of the one pixel (2,), of ``image0``.
 
-        Images are (H, W, 3), (H, W, 4) or (H, W), uint8 or float in [0, 1]. ``n`` modes are fitted, by default as many
-        as the symmetry group has members; "auto" finds their number. ValueError for other images, or for ``xy``
-        outside image0.
+        Images are of any size and each of its own, and of any kind that `mmgsd.images.to_rgb` takes; they are copied.
+        ``n`` modes are returned, one number for all or (S,), by default as many as the symmetry group has members;
+        "auto" finds their number. The group's number is fitted even where fewer are asked for: of these the most
+        probable are the answer, and their weights are divided by their sum. ValueError for other images, for ``xy``
+        outside image0, or for ``n`` that is not from 1 to `MAX_MODES`.
         """
         return self.prepare(image0, image1).match(xy, n=n)
 
     def prepare(self, image0: np.ndarray, image1: np.ndarray) -> Pair:
         """Describe two images once, to ask about them many times; ValueError for other images than `match` takes."""
-        image0, image1 = to_rgb(image0, "image0"), to_rgb(image1, "image1")
-        return Pair(self, image0, image1, self.describe([image0, image1]))
+        images = {name: to_rgb(image, name) for name, image in (("image0", image0), ("image1", image1))}
+        for name, image in images.items():
+            self.compute_input_size(image, name)
+        return Pair(self, *images.values(), tuple(self.describe(list(images.values()))))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Pair:
     """Two images with their descriptors: each question takes a few milliseconds."""
 
     matcher: Matcher
     image0: np.ndarray  # (H0, W0, 3) uint8
     image1: np.ndarray  # (H1, W1, 3) uint8
-    descriptors: Tensor  # (2, C, h, w)
+    descriptors: tuple[Tensor, Tensor]  # (C, h0, w0), (C, h1, w1)
 
     @torch.inference_mode()
-    def match(self, xy: np.ndarray | list, *, n: int | str | None = None) -> Match:
+    def match(self, xy: Any, *, n: Any = None) -> Match:
         """As `Matcher.match`."""
         size0, size1 = ((im.shape[1], im.shape[0]) for im in (self.image0, self.image1))
         points = check_pixels(xy, size0)
         cells = self.matcher.compute_heatmaps(*self.descriptors, torch.from_numpy(points), size0)
         centres = compute_cell_centres(size1, cells.shape[-2:])
-        n, roundness = self.matcher.modes if n is None else n, self.matcher.config.roundness
-        return make_match(self.image0, self.image1, points, cells, centres, n, roundness=roundness)
+        fitted, roundness = self.matcher.modes, self.matcher.config.roundness
+        return make_match(self.image0, self.image1, points, cells, centres, n, fitted=fitted, roundness=roundness)
 
 
 def load(weights: Path | str, *, device: str = "") -> Matcher:
@@ -226,7 +172,7 @@ def load(weights: Path | str, *, device: str = "") -> Matcher:
 
     FileNotFoundError where there are none; ValueError for a file that is damaged or not ours.
     """
-    if not Path(weights).is_file():
+    if not Path(weights).exists():
         folder = find_root() / "data" / "weights"
         names = sorted(path.stem for path in folder.glob("*.safetensors"))
         if str(weights) not in names:
@@ -236,11 +182,17 @@ def load(weights: Path | str, *, device: str = "") -> Matcher:
 
 
 def make_match(
-    image0: np.ndarray, image1: np.ndarray, xy: np.ndarray, cells: Tensor, centres: tuple[Tensor, Tensor], n: int | str,
-    *, roundness: float = ROUNDNESS,
+    image0: np.ndarray, image1: np.ndarray, xy: np.ndarray, cells: Tensor, centres: tuple[Tensor, Tensor], n: Any, *,
+    fitted: int = 1, roundness: float = ROUNDNESS,
 ) -> Match:  # fmt: skip
-    """The answer that heatmaps (S, h, w) with cell ``centres`` (w,), (h,) px hold, however they were made."""
-    fit, entropy = read_heatmap(cells, n, centres, roundness=roundness)
+    """The answer that heatmaps (S, h, w) with cell ``centres`` (w,), (h,) px hold, however they were made.
+
+    At least ``fitted`` modes are fitted, of which the ``n`` most probable are returned; None: as many.
+    """
+    wanted = check_count(fitted if n is None else n, "n", queries=len(cells))
+    fit, entropy = read_heatmap(cells, "auto" if wanted is None else wanted.clamp(min=fitted), centres,
+                                roundness=roundness)  # fmt: skip
+    fit = fit if wanted is None else keep_most_probable(fit, wanted)
     arrays = (t.cpu().numpy() for t in (fit.modes, fit.weights, fit.covariances, entropy, fit.outside, cells))
     return Match(image0, image1, xy, *arrays)
 
@@ -254,46 +206,9 @@ def read_heatmap(
     return fit_modes(heatmap, n, xs, ys, roundness=roundness), entropy
 
 
-def check_question(
-    image0: np.ndarray, image1: np.ndarray, xy: np.ndarray | list
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Both images as (H, W, 3) uint8 and the pixels as (S, 2) float32; ValueError names the argument that is wrong."""
-    image0, image1 = to_rgb(image0, "image0"), to_rgb(image1, "image1")
-    return image0, image1, check_pixels(xy, (image0.shape[1], image0.shape[0]))
-
-
-def read_image(path: Path | str) -> np.ndarray:
-    """(H, W, 3) uint8 of an image file, upright as its camera noted; ValueError for a file that is no image."""
-    try:
-        with Image.open(path) as image:
-            return np.asarray(ImageOps.exif_transpose(image).convert("RGB"))
-    except UnidentifiedImageError as error:
-        raise ValueError(f"{path} is no image that can be read") from error
-
-
-def to_rgb(image: np.ndarray, name: str = "image") -> np.ndarray:
-    """(H, W, 3) uint8 from grey, RGB or RGBA, uint8 or float in [0, 1]; ValueError names the argument otherwise."""
-    image = np.asarray(image)
-    if image.ndim == 2:
-        image = np.repeat(image[..., None], 3, axis=-1)
-    if image.ndim != 3 or image.shape[2] not in (3, 4) or 0 in image.shape:
-        raise ValueError(f"{name} must be (H, W), (H, W, 3) or (H, W, 4), got shape {image.shape}")
-    if np.issubdtype(image.dtype, np.floating):
-        if not np.isfinite(image).all() or image.min() < 0 or image.max() > 1:
-            raise ValueError(f"{name} of dtype {image.dtype} must lie in [0, 1], got {image.min()} to {image.max()}")
-        image = np.rint(image * 255).astype(np.uint8)
-    if image.dtype != np.uint8:
-        raise ValueError(f"{name} must be uint8 or float, got {image.dtype}")
-    return np.ascontiguousarray(image[..., :3])
-
-
-def check_pixels(xy: np.ndarray | list, size: tuple[int, int]) -> np.ndarray:
-    """Pixels (S, 2) float32 inside image0 of ``size`` (width, height); ValueError otherwise."""
-    points = np.asarray(xy, dtype=np.float32).reshape(-1, 2) if np.size(xy) == 0 else np.asarray(xy, dtype=np.float32)
-    if points.ndim != 2 or points.shape[1] != 2:
-        raise ValueError(f"xy must be (S, 2) px, got shape {points.shape}")
-    inside = np.isfinite(points).all(1) & (points >= -0.5).all(1) & (points <= np.array(size) - 0.5).all(1)
-    if not inside.all():
-        bad = points[~inside][0]
-        raise ValueError(f"xy must be finite and inside image0 of {size[0]} x {size[1]} px, got {tuple(bad.tolist())}")
-    return points
+def _check_size(size: tuple[int, int]) -> None:
+    """ValueError unless two whole numbers of px."""
+    low, high = SIZES_PX
+    whole = isinstance(size, tuple | list) and len(size) == 2 and all(type(side) is int for side in size)
+    if not whole or not all(low <= side <= high for side in size):
+        raise ValueError(f"size must be (width, height), two whole numbers of {low} to {high} px, got {size!r:.80}")

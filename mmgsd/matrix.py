@@ -12,24 +12,28 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from dask.distributed import Client, as_completed
 from tqdm.auto import tqdm
 
-from mmgsd.config import METHODS, OBJECTS, OWN_STEPS, Paths, Preset, TrainConfig, find_root, load_preset
+from mmgsd.checkpoints import WEIGHTS, describe_run
+from mmgsd.command import run_command
+from mmgsd.config import METHODS, OBJECTS, OWN_STEPS, Paths, Preset, TrainConfig, find_root, load_preset, read_count
 from mmgsd.evaluation import (
     BASELINES,
     CHANCE,
     evaluate_baseline,
     evaluate_model,
     load_queries,
+    read_results,
     summarise,
     write_results,
 )
-from mmgsd.training import WEIGHTS, describe_run, train_model
+from mmgsd.files import DamagedFileError
+from mmgsd.parameters import read_scheduler
+from mmgsd.training import train_model
 
 FIRST = ("mmgsd", "spcl")  # before the studies
 LATER = ("unimodal", "pcl", "spcl_dense", "mmgsd_plain", "mmgsd_deep", "spcl_deep")  # and after
@@ -125,7 +129,7 @@ def write_tables(preset: Preset, root: Path) -> None:
 def write_main_table(preset: Preset, root: Path) -> dict[str, dict[str, dict]]:
     """Write rmse.json and runs.json, by the rule of `write_tables`; returns the former, {object: {method: row}}."""
     paths = Paths(root, preset.name)
-    errors, costs = (_read(paths.results / f"{name}.json") for name in ("rmse", "runs"))
+    errors, costs = (read_results(paths.results / f"{name}.json", depth=n) for name, n in (("rmse", 2), ("runs", 1)))
     tables, runs = {name: {} for name in OBJECTS}, {}
     for name in OBJECTS:
         models = preset.main_table(name)
@@ -144,8 +148,9 @@ def write_sigma_table(preset: Preset, root: Path, sigmas_px: Sequence[float] = (
 
     The models of other ``steps`` than the smaller budget's have a file of their own: sigma_4000.json.
     """
+    steps = read_count("steps", steps)
     paths, study = Paths(root, preset.name), f"sigma_{steps}" if steps else "sigma"
-    there = [float(sigma) for rows in _read(paths.results / f"{study}.json").values() for sigma in rows]
+    there = _read_keys(paths.results / f"{study}.json", float)
     chosen = [*preset.sigmas_px, *sigmas_px, *there]
     _write_study({name: preset.sigma_table(name, chosen, steps=steps) for name in OBJECTS}, paths, study)
 
@@ -155,15 +160,26 @@ def write_seed_table(preset: Preset, root: Path, seeds: int = 0, *, steps: int =
 
     The models of other ``steps`` than the main table's have a file of their own: seeds_1000.json.
     """
+    seeds, steps = read_count("seeds", seeds), read_count("steps", steps)
     paths, study = Paths(root, preset.name), f"seeds_{steps}" if steps else "seeds"
-    there = [int(key.rpartition("-")[2]) for rows in _read(paths.results / f"{study}.json").values() for key in rows]
+    there = _read_keys(paths.results / f"{study}.json", lambda key: int(key.rpartition("-")[2]))
     chosen = [*range(seeds), *there]
     _write_study({name: preset.seed_table(name, chosen, steps=steps) for name in OBJECTS}, paths, study)
 
 
+def _read_keys(path: Path, convert: Callable[[str], float]) -> list[float]:
+    """The numbers that a study's rows are called by; DamagedFileError where one is none."""
+    try:
+        return [convert(key) for rows in read_results(path, depth=2).values() for key in rows]
+    except ValueError as error:
+        if isinstance(error, DamagedFileError):
+            raise
+        raise DamagedFileError(f"{path} has a row of another study ({error}): restore it, or remove the row") from error
+
+
 def _write_study(models: dict[str, dict[str, TrainConfig]], paths: Paths, study: str) -> None:
     """One file {object: {key: errors, and under "run" the cost}} of models under the same keys, where any is done."""
-    stored, rows = _read(paths.results / f"{study}.json"), {}
+    stored, rows = read_results(paths.results / f"{study}.json", depth=2), {}
     for name, keyed in models.items():
         for key, model in keyed.items():
             kept = stored.get(name, {}).get(key, {})
@@ -182,10 +198,6 @@ def _find_row(paths: Paths, key: str, model: TrainConfig | None, row: dict, run:
     return (row, run) if model is None or run.get("model") == model.name else ({}, {})
 
 
-def _read(path: Path) -> dict:
-    return json.loads(path.read_text()) if path.is_file() else {}
-
-
 def main() -> None:
     """Run the models and baselines of a preset, a line each."""
     parser = argparse.ArgumentParser(prog="python -m mmgsd.matrix", description=__doc__.split("\n")[0])
@@ -202,7 +214,8 @@ def main() -> None:
     tasks = [task for task in tasks if asked.only in name_task(task)]
     if not tasks:
         parser.error(f"--only {asked.only!r}: no model or baseline of the preset {preset.name} has a name with that")
-    done = run_tasks(tasks, preset, find_root(), scheduler=asked.scheduler)
+    scheduler = read_scheduler("--scheduler", asked.scheduler)
+    done = run_tasks(tasks, preset, find_root(), scheduler=scheduler)
     for name, rmse in tqdm(done, total=len(tasks), desc="models and baselines"):
         tqdm.write(f"{name}: {rmse:.1f} px")
         if asked.seeds:
@@ -212,4 +225,6 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(
+        main, kept="finished models and answers are kept, and the same command goes on from the last checkpoint"
+    )

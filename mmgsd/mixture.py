@@ -10,13 +10,14 @@ creeps: SQUAREM (Varadhan and Roland, Scandinavian Journal of Statistics 2008) l
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from mmgsd.config import ROUNDNESS
+from mmgsd.config import MAX_MODES, ROUNDNESS
 
 ANNEALING, ANNEALING_CYCLES = (4.0, 2.0), 6  # temperatures of the flattened heatmaps fitted first, on half the grid
 CYCLES = 60  # of three EM steps and a leap, at most; a query at rest is left alone
@@ -55,15 +56,17 @@ def fit_modes(
     ``heatmap`` (S, h, w) not negative, ``n`` modes for all or (S,), or "auto" for what the Bayesian information
     criterion prefers; ``xs`` (w,) and ``ys`` (h,) cell centres in px. Symmetric modes are a priori equally likely,
     round and equally wide, the latter two by a heatmap mass of ``roundness``: that decides which cell belongs to which
-    mode, while the result holds the moments of the mass itself. Raises ValueError for other shapes, n < 1, another
-    word, or ``roundness`` that is not greater than 0.
+    mode, while the result holds the moments of the mass itself. Raises ValueError for other shapes, ``n`` that is not
+    from 1 to `MAX_MODES`, another word, values that are not finite, or ``roundness`` that is not greater than 0.
     """
     n, n_max = _check_fit(heatmap, n, xs, ys)
-    if not roundness > 0:
+    if not 0 < roundness < np.inf:
         raise ValueError(f"roundness must be greater than 0, got {roundness!r}")
     how = cycles, roundness
     heatmap = heatmap.float()
     total = heatmap.flatten(1).sum(-1, keepdim=True)
+    if not total.isfinite().all():
+        raise ValueError("heatmap must be finite, got NaN or infinity: the weights, or the descriptors, are damaged")
     mass = torch.where(total > 0, heatmap.flatten(1) / total.clamp(min=1e-30), 1 / (len(xs) * len(ys)))
     grid = heatmap.shape[1:]
     mass = _interpolate(mass, grid)
@@ -261,15 +264,55 @@ def _check_fit(heatmap: Tensor, n: int | str | Tensor, xs: Tensor, ys: Tensor) -
     """The number of modes (S,), or None where the data are to choose it, and the most that can be."""
     if heatmap.ndim != 3 or heatmap.shape[1:] != (len(ys), len(xs)):
         raise ValueError(f"heatmap must have shape (S, {len(ys)}, {len(xs)}), got {tuple(heatmap.shape)}")
-    if isinstance(n, str):
-        if n != "auto":
-            raise ValueError(f"n must be a number, one for each query, or 'auto', got {n!r}")
+    n = check_count(n, "n", queries=len(heatmap))
+    if n is None:
         return None, MOST_MODES
-    n = torch.as_tensor(n, device=heatmap.device)
-    if n.is_floating_point() or n.dtype == torch.bool:
-        raise ValueError(f"n must be an integer, or integers, or 'auto', got {n.dtype}")
-    if n.ndim and n.shape != heatmap.shape[:1]:
-        raise ValueError(f"n must be one number or of shape ({len(heatmap)},), got shape {tuple(n.shape)}")
-    if n.numel() and int(n.min()) < 1:
-        raise ValueError(f"n must be at least 1, got {int(n.min())}")
-    return n.expand(len(heatmap)), int(n.max()) if n.numel() else 1
+    return n.to(heatmap.device).expand(len(heatmap)), int(n.max()) if n.numel() else 1
+
+
+def check_count(n: Any, name: str, *, queries: int = 1) -> Tensor | None:
+    """Numbers of modes, () or (S,) for as many ``queries``, or None from "auto".
+
+    ValueError, which names it, for what is not from 1 to `MAX_MODES`.
+    """
+    if isinstance(n, str) and n == "auto":
+        return None
+    accepted = f"{name} must be an integer, or integers, from 1 to {MAX_MODES}, or 'auto'"
+    if isinstance(n, str):
+        raise ValueError(f"{accepted}, got {n!r:.80}")
+    try:
+        count = torch.as_tensor(n)
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        raise ValueError(f"{accepted}, got {n!r:.80}") from error
+    if count.numel() and (count.is_floating_point() or count.is_complex() or count.dtype == torch.bool):
+        raise ValueError(f"{accepted}, got {count.dtype}: {n!r:.80}")
+    if count.ndim and count.shape != (queries,):
+        raise ValueError(f"{name} must be one number or of shape ({queries},), got shape {tuple(count.shape)}")
+    if count.numel() and int(count.min()) < 1:
+        raise ValueError(f"{name} must be at least 1, got {int(count.min())}")
+    if count.numel() and int(count.max()) > MAX_MODES:
+        raise ValueError(f"{name} must be at most {MAX_MODES}, got {int(count.max())}")
+    return count.long()
+
+
+def check_modes(modes: Any) -> None:
+    """ValueError for a model's number of modes that is not from 1 to `MAX_MODES`."""
+    whole = isinstance(modes, int | np.integer) and not isinstance(modes, bool)
+    if not whole or not 1 <= modes <= MAX_MODES:
+        raise ValueError(f"modes must be an integer from 1 to {MAX_MODES}, got {modes!r}")
+
+
+def keep_most_probable(fit: Mixture, n: Tensor) -> Mixture:
+    """The ``n``, () or (S,), most probable modes of each fit, (S, max n, …), their weights divided by their sum.
+
+    ``outside`` stays that of all modes that were fitted.
+    """
+    most = min(int(n.max()), fit.weights.shape[1]) if n.numel() else fit.weights.shape[1]
+    n = n.to(fit.weights.device).expand(len(fit.weights))
+    absent = torch.arange(most, device=n.device) >= n[:, None]  # (S, most)
+    weights = fit.weights[:, :most].masked_fill(absent, 0)
+    if not torch.equal(weights.count_nonzero(1), fit.weights.count_nonzero(1)):
+        weights = weights / weights.sum(1, keepdim=True)
+    modes = fit.modes[:, :most].masked_fill(absent[..., None], torch.nan)
+    covariances = fit.covariances[:, :most].masked_fill(absent[..., None, None], torch.nan)
+    return Mixture(modes, weights, covariances, fit.outside)

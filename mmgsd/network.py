@@ -278,6 +278,23 @@ def compute_input_size(size: tuple[int, int], input_px: int) -> tuple[int, int]:
     return tuple(max(16, round(side * scale / 8) * 8) for side in size)
 
 
+def fit_input_size(
+    size: tuple[int, int], trained: tuple[int, int], input_px: int, *, least_px: int = 48
+) -> tuple[int, int]:
+    """(width, height) of the network's input for an image of ``size`` whose aspect is not that of the ``trained``.
+
+    The image keeps its aspect and has as many pixels as the training's inputs: an object that takes the usual share of
+    its picture is then as large as the network knows it. Were the longer sides made equal, a photograph wider than the
+    training's would show it too small; the shorter ones, too large. Only a strip whose shorter side would have less
+    than ``least_px`` is enlarged.
+    """
+    if size[0] * trained[1] == size[1] * trained[0]:
+        return compute_input_size(trained, input_px)
+    area = input_px**2 * min(trained) / max(trained)  # px²
+    scale = max((area / (size[0] * size[1])) ** 0.5, least_px / min(size))
+    return tuple(round(side * scale / 8) * 8 for side in size)
+
+
 def compute_cell_centres(size: tuple[int, int], shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """Full-image px of a (h, w) grid's columns (w,) and rows (h,)."""
     sx, sy = size[0] / shape[1], size[1] / shape[0]

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 
+import cv2
 import numpy as np
 import pandas as pd
 from matplotlib import colormaps
@@ -38,6 +40,7 @@ from mmgsd.metrics import BIN_PX, ErrorSummary
 
 _ORBIT_COLOURS = ("#D55E00", "#56B4E9", "#FFE100", "#009E73")
 SEGMENTS = 25  # of a rope
+PAGE_QUERIES, PANEL_PX = 100, 640  # on one page at most; the longer side of an image in a panel of it
 
 
 @styled
@@ -46,14 +49,54 @@ def plot_match(match: Match, index: int = 0) -> Figure:
 
     Each mode has its 1-std ellipse, its marker's area shows its weight. ValueError where ``index`` is not in [0, S).
     """
-    if not 0 <= index < len(match.xy):
-        raise ValueError(f"index must be in [0, {len(match.xy)}), got {index!r}")
+    whole = isinstance(index, int | np.integer) and not isinstance(index, bool)
+    if not whole or not 0 <= index < len(match):
+        raise ValueError(f"index must be in [0, {len(match)}), got {index!r}")
     figure, axes = make_grid([match.image0.shape[0] / match.image0.shape[1]], 2, PAGE_IN * 0.7)
     show_source(axes[0, 0], match, index)
     show_answer(axes[0, 1], match, index)
     axes[0, 0].set_title("Source")
     axes[0, 1].set_title(f"Matches · entropy {match.entropy[index]:.1f} nats")
     return figure
+
+
+@styled
+def plot_page(match: Match) -> Figure:
+    """All queries, two beside each other: the source's pixel, the answer, and above them number, pixel and entropy.
+
+    ValueError for none, or for more than `PAGE_QUERIES`.
+    """
+    if not 1 <= len(match) <= PAGE_QUERIES:
+        raise ValueError(f"match must hold 1 to {PAGE_QUERIES} queries to be drawn, got {len(match)}")
+    small = _shrink(match)
+    aspect = max(image.shape[0] / image.shape[1] for image in (match.image0, match.image1))
+    columns = 4 if len(match) > 1 else 2
+    figure, axes = make_grid([aspect] * -(-2 * len(match) // columns), columns, PAGE_IN)
+    for axis in axes.flat[2 * len(match) :]:
+        axis.set_axis_off()
+    for index, (source, answer) in enumerate(axes.reshape(-1, 2)[: len(match)]):
+        show_source(source, small, index)
+        show_answer(answer, small, index)
+        x, y = match.xy[index]
+        source.set_title(f"{index + 1} · pixel {x:g}, {y:g}")
+        answer.set_title(f"entropy {match.entropy[index]:.1f} nats")
+    return figure
+
+
+def _shrink(match: Match) -> Match:
+    """The same answer about images of at most PANEL_PX: what a panel of a page shows, in a page's memory."""
+    places = {}
+    for name in ("image0", "image1"):
+        image = getattr(match, name)
+        height, width = image.shape[:2]
+        scale = min(1, PANEL_PX / max(width, height))
+        size = max(1, round(width * scale)), max(1, round(height * scale))
+        places[name] = cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.array(size) / (width, height)
+    (image0, scale0), (image1, scale1) = places["image0"], places["image1"]
+    return dataclasses.replace(
+        match, image0=image0, image1=image1, xy=(match.xy + 0.5) * scale0 - 0.5, modes=(match.modes + 0.5) * scale1
+        - 0.5, covariances=match.covariances * scale1[:, None] * scale1,
+    )  # fmt: skip
 
 
 @styled

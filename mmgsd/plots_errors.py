@@ -120,7 +120,8 @@ def plot_worst(matches: Sequence[Match], true: Sequence[np.ndarray], errors_px: 
     for axis, match, xy, error in zip(axes.flat, matches, true, errors_px, strict=False):
         (height, width), left = match.image1.shape[:2], match.image0.shape[1]
         axis.imshow(match.image0, extent=(-0.5 - left, -0.5, height - 0.5, -0.5))
-        axis.imshow(blend_heatmap(match.image1, match.heatmap[0]), extent=(-0.5, width - 0.5, height - 0.5, -0.5))
+        blended = blend_heatmap(match.image1, match.compute_heatmap())
+        axis.imshow(blended, extent=(-0.5, width - 0.5, height - 0.5, -0.5))
         axis.set(xlim=(-0.5 - left, width - 0.5), ylim=(height - 0.5, -0.5))
         mark_pixel(axis, match.xy[0, 0] - left, match.xy[0, 1])
         draw_modes(axis, match, 0)

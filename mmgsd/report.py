@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
-import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -20,7 +18,10 @@ import numpy as np
 
 from mmgsd import report_tables as tables
 from mmgsd.claims import list_claims
+from mmgsd.command import run_command
 from mmgsd.config import IMAGE_SIZE, N_POINTS, OBJECTS, Paths, find_root, load_preset
+from mmgsd.files import write_text
+from mmgsd.tables import read_table, told_where
 
 FILES = ("rmse", "runs", "budget", "sigma", "uncertainty", "symmetry", "broken_symmetry", "errors", "seeds_1000")
 ENDS = 0.1  # of a rope's length at each end, its extremities; the middle is the fifth around its centre
@@ -29,22 +30,27 @@ Results = Mapping[str, Any]
 
 
 def write_report(preset: str, root: Path) -> list[Path]:
-    """Write everything that the report inputs into ``paper/generated``; ValueError for an unknown preset."""
+    """Write everything that the report inputs into ``paper/generated``; ValueError for an unknown preset.
+
+    DamagedFileError, which names the file or the folder, where a number is missing or is none.
+    """
     config, paths = load_preset(preset), Paths(root, preset)
     results = load_results(paths.results)
-    claims = list_claims(results)
-    described = dataclasses.asdict(config) | {"image_size": IMAGE_SIZE}
-    numbers = {**results, "config": described, "verdict": {claim.key: claim.verdict for claim in claims}}
-    texts = {"results": make_definitions(preset, numbers), "claims_table": tables.make_claims_table(claims)}
+    with told_where(paths.results):
+        claims = list_claims(results)
+        described = dataclasses.asdict(config) | {"image_size": IMAGE_SIZE}
+        numbers = {**results, "config": described, "verdict": {claim.key: claim.verdict for claim in claims}}
+        texts = {"results": make_definitions(preset, numbers), "claims_table": tables.make_claims_table(claims)}
     for name, (file, make) in tables.TABLES.items():
-        texts[name] = make(results[file]) if file in results else tables.NOT_RUN
-    return [_write(root / "paper" / "generated" / f"{name}.tex", text) for name, text in texts.items()]
+        with told_where(paths.results / f"{file}.json"):
+            texts[name] = make(results[file]) if file in results else tables.NOT_RUN
+    return [write_text(root / "paper" / "generated" / f"{name}.tex", f"{text}\n") for name, text in texts.items()]
 
 
 def load_results(folder: Path) -> dict[str, Any]:
     """{name: content} of the results files that are there, and ``places`` where the figures' data are."""
     files = {name: folder / f"{name}.json" for name in FILES}
-    results = {name: json.loads(path.read_text()) for name, path in files.items() if path.is_file()}
+    results = {name: read_table(path) for name, path in files.items() if path.is_file()}
     drawn = {name: folder / f"figures_{name}.safetensors" for name in OBJECTS}
     places = {name: measure_places(path, name) for name, path in drawn.items() if path.is_file()}
     return results | ({"places": places} if places else {})
@@ -95,14 +101,6 @@ def make_definitions(preset: str, numbers: Results) -> str:
     return "\n".join([rf"\newcommand{{\preset}}{{{tables.escape(preset)}}}", *lines])
 
 
-def _write(path: Path, text: str) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_suffix(".tmp")
-    aside.write_text(text + "\n")
-    os.replace(aside, path)
-    return path
-
-
 def main() -> None:
     """Write the numbers and tables of one preset."""
     parser = argparse.ArgumentParser(prog="python -m mmgsd.report", description=__doc__.split("\n")[0])
@@ -112,4 +110,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

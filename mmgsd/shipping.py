@@ -7,16 +7,18 @@ python -m mmgsd.shipping paper --restore      and back: evaluation and figures t
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
-import os
-import shutil
 from pathlib import Path
 
 import torch
-from safetensors.torch import load_file, save_file
 
-from mmgsd.config import OBJECTS, Paths, TrainConfig, find_root, from_dict, load_preset
-from mmgsd.training import WEIGHTS, load_metadata
+from mmgsd.checkpoints import WEIGHTS, load_metadata, read_config, read_tensors, write_tensors
+from mmgsd.command import run_command
+from mmgsd.config import OBJECTS, Paths, TrainConfig, find_root, load_preset
+from mmgsd.evaluation import read_results
+from mmgsd.files import DamagedFileError, ForeignFileError, locked, set_aside, write_bytes, write_text
+from mmgsd.parameters import check_made
 
 SHIPPED = {"mmgsd": "", "spcl": "-spcl"}  # method: what its files' names end with
 CARD = """# {title}
@@ -41,46 +43,73 @@ def ship_model(weights: Path, out: Path, facts: dict) -> Path:
 
     A file that says the same already is left alone: the order of a safetensors header's entries is not kept.
     ``facts``: ``preset``, ``data_seed`` and the results ``rmse_mean``, ``median``, ``queries``.
+    DamagedFileError for damaged weights, ForeignFileError where ``out`` or the card's place is another kind of file.
     """
-    state = {name: value.half() if value.ndim > 1 else value for name, value in load_file(weights).items()}
-    note = load_metadata(weights)
+    tensors, note = read_tensors(weights)
+    state = {name: value.half() if value.ndim > 1 else value for name, value in tensors.items()}
+    config, _ = read_config(weights)
+    _check_replaceable(out)
     if not out.is_file() or not _holds(out, state, note):
-        out.parent.mkdir(parents=True, exist_ok=True)
-        aside = out.with_suffix(".tmp")
-        save_file(state, aside, note)
-        os.replace(aside, out)
+        write_tensors(out, state, note)
     width, height = json.loads(note["size"])
     described = {
-        **json.loads(note["config"]), **note, **facts, "name": out.stem, "width": width, "height": height,
+        **dataclasses.asdict(config), **note, **facts, "name": out.stem, "width": width, "height": height,
         "title": f"{out.stem}.safetensors", "minutes": float(note["seconds"]) / 60,
         "megabytes": out.stat().st_size / 1e6,
     }  # fmt: skip
-    out.with_suffix(".md").write_text(CARD.format(**described))
+    write_text(out.with_suffix(".md"), CARD.format(**described))
     return out
+
+
+def _check_replaceable(out: Path) -> None:
+    """Refuse to replace what is no shipped model, or no card of one; a damaged model is set aside."""
+    card = out.with_suffix(".md")
+    if card.is_file() and not card.read_text(errors="replace").startswith(f"# {out.name}\n"):
+        raise ForeignFileError(f"{card} is no card of {out.name}: move it away, or choose another name")
+    if not out.is_file():
+        return
+    try:
+        note = load_metadata(out)
+    except DamagedFileError:
+        set_aside(out)
+        return
+    if note.get("format") != "mmgsd-1":
+        raise ForeignFileError(f"{out} holds no weights of this project: move it away, or choose another name")
 
 
 def restore_model(shipped: Path, folder: Path, config: TrainConfig) -> Path:
     """Copy a shipped model to where training would have left it; the path of its weights, which stay half precision.
 
-    A model that is trained there is left as it is. ValueError where the shipped one has another configuration.
+    A model that is trained there is left as it is, unless it is damaged. ValueError where the shipped one has another
+    configuration or is damaged, LockedError while one is trained there.
     """
-    theirs = from_dict(TrainConfig, json.loads(load_metadata(shipped)["config"]))
+    read_tensors(shipped)
+    theirs, _ = read_config(shipped)
     if theirs != config:
         raise ValueError(f"{shipped} is {theirs.name}, and {config.name} was asked for: train that one")
     weights = folder / WEIGHTS
-    if not weights.is_file():
-        folder.mkdir(parents=True, exist_ok=True)
-        aside = weights.with_suffix(".tmp")
-        shutil.copyfile(shipped, aside)
-        os.replace(aside, weights)
+    with locked(folder, "restoring"):
+        if not _is_whole(weights):
+            write_bytes(weights, shipped.read_bytes())
     return weights
 
 
+def _is_whole(weights: Path) -> bool:
+    """Whether there are weights; damaged ones are set aside."""
+    if not weights.is_file():
+        return False
+    try:
+        read_tensors(weights)
+    except DamagedFileError:
+        set_aside(weights)
+    return weights.is_file()
+
+
 def _holds(file: Path, state: dict[str, torch.Tensor], note: dict[str, str]) -> bool:
-    held = load_file(file)
+    held, said = read_tensors(file)
     return (
         held.keys() == state.keys()
-        and load_metadata(file) == note
+        and said == note
         and all(torch.equal(held[name], value) for name, value in state.items())
     )
 
@@ -99,10 +128,11 @@ def main() -> None:
             if file.is_file():
                 print(restore_model(file, paths.model(models[key]), models[key]))
         return
-    results = json.loads((paths.results / "rmse.json").read_text())
+    check_made(paths, "04_evaluate", [paths.results / "rmse.json"])
+    results = read_results(paths.results / "rmse.json", depth=2)
     for (name, method), model in models.items():
         weights = paths.model(model) / WEIGHTS
-        if not weights.is_file() or method not in results[name]:
+        if not weights.is_file() or method not in results.get(name, {}):
             print(f"{name} {method}: not trained and evaluated yet")
             continue
         facts = {"preset": asked.preset, "data_seed": config.render[name].seed, **results[name][method]}
@@ -111,4 +141,4 @@ def main() -> None:
 
 if __name__ == "__main__":
     torch.set_grad_enabled(False)
-    main()
+    run_command(main)

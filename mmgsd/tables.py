@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-import json
-import os
+import argparse
 import re
 import statistics
-import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from mmgsd.command import run_command
 from mmgsd.config import LONGER
+from mmgsd.files import DamagedFileError, read_json, write_text
+
+REMEDY = "restore it (it may be in git), or run its notebook again"
 
 PAPER = {"cloth": 32.4, "rope": 31.3}  # px, MMGSD's RMSE as the paper reports it
 LABELS = {
@@ -77,7 +80,7 @@ def make_symmetry_table(results: dict[str, dict[str, Any]]) -> str:
     lines = ["| taught and asked | all | corners | edges | interior |", "|---|---|---|---|---|"]
     for group, row in results.items():
         errors = [row["rmse_mean"], *(row["regions"][region]["rmse_px"] for region in ("corner", "edge", "interior"))]
-        lines.append(f"| {GROUPS[group]} | {' | '.join(f'{error:.1f}' for error in errors)} |")
+        lines.append(f"| {GROUPS.get(group, f'`{group}`')} | {' | '.join(f'{error:.1f}' for error in errors)} |")
     return "\n".join(lines)
 
 
@@ -133,21 +136,39 @@ def _format_uncertainty(after: dict[str, float | None], before: dict[str, float 
 def update_tables(document: Path, results: Path) -> None:
     """Make every marked table of a Markdown file anew from the folder of results.
 
-    Raises ValueError where the file marks no table, or one that `TABLES` does not have.
+    Raises ValueError where the file marks no table, or one that `TABLES` does not have, DamagedFileError where a
+    results file is damaged.
     """
 
     def fill(marked: re.Match[str]) -> str:
         if marked["name"] not in TABLES:
             raise ValueError(f"{document} marks a table {marked['name']!r}, accepted are {', '.join(TABLES)}")
         file, make = TABLES[marked["name"]]
-        return marked["begin"] + make(json.loads((results / file).read_text())) + marked["end"]
+        values = read_table(results / file)
+        with told_where(results / file):
+            return marked["begin"] + make(values) + marked["end"]
 
     text, tables = MARKED.subn(fill, document.read_text())
     if not tables or text.count("made by `make readme`") != tables:
         raise ValueError(f"{document} must hold at least one table, each between {BEGIN!r} and {END!r}")
-    aside = document.with_suffix(".tmp")
-    aside.write_text(text)
-    os.replace(aside, document)
+    write_text(document, text)
+
+
+def read_table(path: Path) -> dict[str, Any]:
+    """The content of a results file; FileNotFoundError, or DamagedFileError where it is no dictionary."""
+    values = read_json(path, remedy=REMEDY)
+    if not isinstance(values, dict):
+        raise DamagedFileError(f"{path} holds no table of results: {REMEDY}")
+    return values
+
+
+@contextmanager
+def told_where(path: Path) -> Iterator[None]:
+    """Name the file in which a number is missing, or is none."""
+    try:
+        yield
+    except (LookupError, TypeError, AttributeError) as error:
+        raise DamagedFileError(f"{path} lacks a number, or has one that is none ({error!r}): {REMEDY}") from error
 
 
 BEGIN, END = "<!-- NAME: made by `make readme` -->", "<!-- end of NAME -->"
@@ -168,6 +189,16 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "uncertainty_quick": ("quick/uncertainty.json", make_uncertainty_table),
 }
 
+
+def main() -> None:
+    """Update the tables of some documents."""
+    parser = argparse.ArgumentParser(prog="python -m mmgsd.tables", description=__doc__)
+    parser.add_argument("results", type=Path, help="the folder of results, data/results")
+    parser.add_argument("documents", type=Path, nargs="+", help="Markdown files that mark tables")
+    asked = parser.parse_args()
+    for document in asked.documents:
+        update_tables(document, asked.results)
+
+
 if __name__ == "__main__":
-    for name in sys.argv[2:]:
-        update_tables(Path(name), Path(sys.argv[1]))
+    run_command(main)

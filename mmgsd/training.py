@@ -6,7 +6,6 @@ import dataclasses
 import json
 import math
 import os
-import shutil
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,40 +14,39 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import torch
-from safetensors import safe_open
-from safetensors.torch import save_file
 from torch import Tensor
-from torch.nn import functional as F
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torch.utils import deterministic
 from tqdm.auto import tqdm
 
-from mmgsd import distributed, losses
+from mmgsd import distributed
 from mmgsd.augmentation import Batch, load_training_images, make_batch
-from mmgsd.config import CONTRASTIVE, DETAILED, MATCHES_OF_ONE, PASSES, TrainConfig, from_dict
-from mmgsd.dataset import Dataset, hold_out, join_datasets, load_dataset
-from mmgsd.evaluation import calibrate_bandwidth, calibrate_temperature, measure_rmse
-from mmgsd.matching import Matcher, load
-from mmgsd.network import (
-    build_network,
-    compute_cell_centres,
-    find_device,
-    sample_descriptors,
+from mmgsd.checkpoints import (
+    CHECKPOINT,
+    LOG,
+    WEIGHTS,
+    check_enough,
+    held,
+    is_trained,
+    read_checkpoint,
+    remove_run,
+    write_checkpoint,
+    write_tensors,
 )
-from mmgsd.objective import compute_head_loss
+from mmgsd.checkpoints import describe_run as describe_run  # what others ask of a training
+from mmgsd.checkpoints import load_metadata as load_metadata
+from mmgsd.config import CONTRASTIVE, DETAILED, MATCHES_OF_ONE, PASSES, TrainConfig, read_count, read_flag
+from mmgsd.dataset import Dataset, hold_out, join_datasets, load_parts
+from mmgsd.evaluation import calibrate_bandwidth, calibrate_temperature, measure_rmse
+from mmgsd.files import DamagedFileError, saying_what_stays, set_aside, write_text
+from mmgsd.matching import Matcher, load
+from mmgsd.network import build_network, find_device, sample_descriptors
+from mmgsd.objective import compute_head_loss, compute_loss
 from mmgsd.optimiser import make_optimisers
 from mmgsd.prototypes import compute_prototype_loss, make_prototypes
 
-WEIGHTS, CHECKPOINT, LOG = "weights.safetensors", "checkpoint.safetensors", "log.csv"
 PROTOTYPE_EVERY = 4  # each step asks every so many material points
 CHECKPOINT_SECONDS = 60.0  # of training between two checkpoints
-
-
-def compute_sigma(config: TrainConfig, step: int) -> float:
-    """Std of the target at a step in px: geometric from ``sigma_start_px`` to ``sigma_px`` over two thirds."""
-    progress = min(1.0, step / max(1.0, config.steps * 2 / 3))
-    start = max(config.sigma_start_px, config.sigma_px)
-    return start * (config.sigma_px / start) ** progress
 
 
 def compute_learning_rate(config: TrainConfig, step: int) -> float:
@@ -72,65 +70,40 @@ def train_model(
     and the first one writes the files. The losses and gradients are those of a single process.
 
     A finished model is returned as it is, a killed run goes on from its last checkpoint and ends with the same weights.
+    ``overwrite`` removes weights, checkpoint and log of the folder, nothing else.
     On a CPU two runs on as many threads give the same weights to the last bit; on a GPU they do not.
-    Raises ValueError where the data set is of another object or does not store the symmetry group, and where
-    ``config.trunk_weights`` are of another network; FileNotFoundError where there are none.
+    Raises ValueError where the data set is of another object, does not store the symmetry group or has too few images,
+    and where ``config.trunk_weights`` are of another network; FileNotFoundError where there are none; LockedError while
+    another process trains in the folder.
     """
+    overwrite, progress = read_flag("overwrite", overwrite), read_flag("progress", progress)
+    validate_every, folder = read_count("validate_every", validate_every), Path(folder)
     weights = folder / WEIGHTS
-    if weights.is_file() and not overwrite:
-        if load_metadata(weights).get("data") != join_datasets(*_load_data(config, dataset, "test")).fingerprint:
-            raise ValueError(f"{weights} was trained on another data set than {dataset}: use overwrite=True")
+    if not overwrite and is_trained(weights, dataset, also=config.also):
         return weights
-    data = _load_data(config, dataset, "train")
-    if data[0].object != config.object:
-        raise ValueError(f"object is {config.object!r}, but {dataset} shows a {data[0].object}")
-    with distributed.joined(config.groups, device or find_device()) as team, _repeatable(team.device):
-        run = _Run(config, data, folder, team, validate_every)  # what is wrong is said before anything is deleted
-        if overwrite and team.rank == 0 and folder.exists():
-            shutil.rmtree(folder)
+    parts = load_parts(dataset, "train", also=config.also)
+    if parts[0].object != config.object:
+        raise ValueError(f"object is {config.object!r}, but {dataset} shows a {parts[0].object}")
+    with distributed.joined(config.groups, device or find_device()) as team, held(folder, team), (
+        _repeatable(team.device)
+    ):  # fmt: skip
+        # by the process that held the folder before
+        if not overwrite and is_trained(weights, dataset, also=config.also):
+            return weights
+        run = _Run(config, parts, folder, team, validate_every)  # what is wrong is said before anything is deleted
+        if overwrite and team.rank == 0:
+            remove_run(folder)
         team.wait()
         run.resume()
         shown = progress and team.rank == 0
         bar = tqdm(range(run.step, config.steps), desc=config.name, disable=not shown, leave=False)
-        for _ in bar:
-            bar.set_postfix(loss=f"{run.advance():.3f}", refresh=False)
-        if team.rank == 0:
-            run.finish(weights)
+        with saying_what_stays(run.describe_kept):
+            for _ in bar:
+                bar.set_postfix(loss=f"{run.advance():.3f}", refresh=False)
+            if team.rank == 0:
+                run.finish(weights)
         team.wait()
     return weights
-
-
-def compute_loss(
-    config: TrainConfig, descriptors: Tensor, batch: Batch, permutations: Tensor, size: tuple[int, int], step: int,
-    group: int = 0,
-) -> Tensor:  # fmt: skip
-    """The configured method's loss of a group of a batch: every image is a source and a target of others in it.
-
-    ``descriptors`` (B, C, h, w), a source's D first, a target's last; ``permutations`` (G, P) of the matches the method
-    knows. Randomness comes from seed, step and the group's number.
-    """
-    seed = (config.seed * 1_000_003 + step) * config.groups + group
-    generator = torch.Generator(descriptors.device).manual_seed(seed)
-    pairs = config.pairs // config.groups
-    pair = _sample_batch_pairs(len(descriptors), pairs, generator, descriptors.device)  # (2, K)
-    points = torch.multinomial(batch.askable[pair[0]].float() + 1e-9, config.queries, True, generator=generator)
-    orbit = permutations[:, points].permute(1, 2, 0)  # (K, Q, G)
-    target = descriptors[:, -config.descriptor_dim :]  # (B, D, h, w)
-    sampled = sample_descriptors(descriptors, batch.xy, size)  # (B, P, C)
-    source = sampled[pair[0][:, None], points, : config.descriptor_dim]  # (K, Q, D)
-    modes = batch.xy[pair[1][:, None, None], orbit]  # (K, Q, G, 2)
-    valid = batch.inside[pair[1][:, None, None], orbit] & batch.askable[pair[0][:, None], points][..., None]
-    if config.method in CONTRASTIVE:
-        valid = valid & batch.askable[pair[1][:, None, None], orbit]  # as in Dense Object Nets: seen in both images
-        there = sampled[pair[1][:, None, None], orbit, -config.descriptor_dim :]  # (K, Q, G, D)
-        match = (source[:, :, None] - there).square().sum(-1)
-        far, apart = _sample_non_matches(config, target, batch, pair, source, modes, size, generator)
-        function = losses.pcl if config.method == "pcl" else losses.spcl
-        return function((match + 1e-12).sqrt(), valid, (far + 1e-12).sqrt(), apart, margin=config.margin)
-    xs, ys = (c.to(descriptors.device) for c in compute_cell_centres(size, descriptors.shape[-2:]))
-    wanted = losses.compute_target(modes, valid, xs, ys, compute_sigma(config, step))
-    squared = losses.compute_squared_distances(source, target[pair[1]].flatten(2).mT)
-    return losses.mmgsd(squared, wanted)
 
 
 class _Run:
@@ -143,6 +116,7 @@ class _Run:
         # the latter for calibration
         self.data, self.held_out = (join_datasets(*split) for split in zip(*map(hold_out, parts), strict=True))
         data = self.data
+        check_enough(data, self.held_out)
         self.device, self.size = team.device, data.size
         device = team.device
         group = data.group(config.group)
@@ -158,7 +132,7 @@ class _Run:
         self.prototypes = torch.nn.Parameter(start.to(device))
         self.trained = [p for p in self.network.parameters() if p.requires_grad]
         self.optimisers = make_optimisers(self.network, [self.prototypes], config)
-        self.step, self.seconds, self.saved_at, self.log = 0, 0.0, 0.0, []
+        self.step, self.seconds, self.saved_at, self.saved_step, self.log = 0, 0.0, 0.0, 0, []
 
     def advance(self) -> float:
         """One optimiser step; saves a checkpoint every ``CHECKPOINT_SECONDS``."""
@@ -223,30 +197,46 @@ class _Run:
         return measure_rmse(self.make_matcher(), self.held_out)
 
     def save(self) -> None:
-        """Write a checkpoint aside, then rename it."""
-        self.folder.mkdir(parents=True, exist_ok=True)
-        tensors = {"prototypes": self.prototypes.detach()}
-        for part in ("network", "average"):
-            tensors |= {f"{part}/{name}": value for name, value in getattr(self, part).state_dict().items()}
+        """Write a checkpoint whole or not at all."""
+        tensors = {"prototypes": self.prototypes.detach(), **self._list_weights()}
         for number, optimiser in enumerate(self.optimisers):
             for index, values in optimiser.state_dict()["state"].items():
                 tensors |= {f"optimisers/{number}/{index}/{name}": value for name, value in values.items()}
         numbers = {"step": self.step, "seconds": self.seconds, "log": self.log}
-        metadata = {"config": self._describe_config(), "numbers": json.dumps(numbers)}
-        aside = self.folder / (CHECKPOINT + ".tmp")
-        save_file({name: value.contiguous() for name, value in tensors.items()}, aside, metadata)
-        os.replace(aside, self.folder / CHECKPOINT)
-        self.saved_at = self.seconds
+        write_checkpoint(self.folder / CHECKPOINT, tensors, self._describe_config(), numbers)
+        self.saved_at, self.saved_step = self.seconds, self.step
+
+    def describe_kept(self) -> str:
+        """What is on disk of a run that is stopped."""
+        kept = f"its checkpoint of step {self.saved_step} is kept in {self.folder}: call again without overwrite"
+        return f"training was stopped after step {self.step}; {kept if self.saved_step else 'nothing is kept yet'}"
+
+    def _list_weights(self) -> dict[str, Tensor]:
+        parts = {part: getattr(self, part).state_dict() for part in ("network", "average")}
+        return {f"{part}/{name}": value for part, values in parts.items() for name, value in values.items()}
+
+    def _read_checkpoint(self) -> tuple[dict[str, Tensor], dict[str, str]] | None:
+        """The folder's checkpoint, if there is one; the first process sets a damaged one aside before any goes on."""
+        path, found = self.folder / CHECKPOINT, None
+        like = {"prototypes": self.prototypes, **self._list_weights()}
+        if self.team.rank == 0 and path.is_file():
+            try:
+                found = read_checkpoint(path, like, str(self.device))
+            except DamagedFileError:
+                set_aside(path)
+        self.team.wait()
+        if self.team.rank and path.is_file():
+            found = read_checkpoint(path, like, str(self.device))
+        return found
 
     def resume(self) -> None:
         """Go on from the folder's checkpoint, if there is one; ValueError where it is of another configuration."""
-        path = self.folder / CHECKPOINT
-        if not path.is_file():
+        found = self._read_checkpoint()
+        if found is None:
             return
-        with safe_open(path, "pt", device=str(self.device)) as file:
-            metadata = file.metadata()
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        tensors, metadata = found
         if metadata["config"] != self._describe_config():
+            path = self.folder / CHECKPOINT
             raise ValueError(f"{path} belongs to another configuration: choose another folder or overwrite=True")
         self.prototypes.data.copy_(tensors.pop("prototypes"))
         parts = {"network": {}, "average": {}, "optimisers": {}}
@@ -266,15 +256,19 @@ class _Run:
             optimiser.load_state_dict({**optimiser.state_dict(), "state": state})
         numbers = json.loads(metadata["numbers"])
         self.step, self.seconds, self.log = numbers["step"], numbers["seconds"], numbers["log"]
-        self.saved_at = self.seconds
+        self.saved_at, self.saved_step = self.seconds, self.step
 
     def _describe_config(self) -> str:
         return json.dumps(dataclasses.asdict(self.config))
 
     def finish(self, weights: Path) -> Path:
-        """Write log and weights, the weights last: a folder that has them is finished."""
-        self.folder.mkdir(parents=True, exist_ok=True)
-        pd.DataFrame(self.log).to_csv(self.folder / LOG, index=False)
+        """Write log and weights, the weights last: a folder that has them is finished.
+
+        The trained weights are in a checkpoint before they are calibrated: what fails there costs no training.
+        """
+        if self.saved_step < self.step:
+            self.save()
+        write_text(self.folder / LOG, pd.DataFrame(self.log).to_csv(index=False))
         metadata = {
             "format": "mmgsd-1",
             "config": json.dumps(dataclasses.asdict(self.config)),
@@ -289,32 +283,9 @@ class _Run:
         if matcher.bandwidth is not None:
             metadata["bandwidth"] = repr(matcher.bandwidth)
         metadata["temperature"] = repr(calibrate_temperature(matcher, self.held_out))
-        state = {name: value.contiguous() for name, value in self.average.module.state_dict().items()}
-        aside = weights.with_suffix(".tmp")
-        save_file(state, aside, metadata)
-        os.replace(aside, weights)
+        write_tensors(weights, self.average.module.state_dict(), metadata)
         (self.folder / CHECKPOINT).unlink(missing_ok=True)
         return weights
-
-
-def _load_data(config: TrainConfig, dataset: Path, split: str) -> list[Dataset]:
-    """The data set, and that of the preset ``config.also``, which lies beside it, where one is named."""
-    folders = [dataset, *([dataset.parents[1] / config.also / dataset.name] if config.also else [])]
-    return [load_dataset(folder, split) for folder in folders]
-
-
-def load_metadata(weights: Path | str) -> dict[str, str]:
-    """What a weights file says of itself: ``config``, ``seconds`` of training, ``hardware``, ``images``, …"""
-    with safe_open(weights, "pt") as file:
-        return file.metadata() or {}
-
-
-def describe_run(weights: Path | str) -> dict[str, int | float | str]:
-    """Which model it is and what it cost: its name, steps, minutes, training images, seed, hardware."""
-    note = load_metadata(weights)
-    config, minutes = from_dict(TrainConfig, json.loads(note["config"])), round(float(note["seconds"]) / 60, 2)
-    run = {"model": config.name, "steps": config.steps, "minutes": minutes, "images": int(note["images"])}
-    return {**run, "seed": config.seed, "hardware": note["hardware"]}
 
 
 @contextmanager
@@ -328,6 +299,14 @@ def _repeatable(device: torch.device) -> Iterator[None]:
     finally:
         torch.use_deterministic_algorithms(before)
         deterministic.fill_uninitialized_memory = filled
+
+
+def check_start(config: TrainConfig, models: Path) -> None:
+    """ValueError where ``config.trunk_weights`` do not fit the network, FileNotFoundError where there are none.
+
+    ``models`` is the folder that a model's name is looked for in, before data/weights.
+    """
+    _make_network(config, models)
 
 
 def _make_network(config: TrainConfig, models: Path) -> torch.nn.Module:
@@ -356,37 +335,3 @@ def _name_hardware(device: torch.device) -> str:
 
 def _cosine(progress: float) -> float:
     return 0.5 * (1 + math.cos(math.pi * min(1.0, progress)))
-
-
-def _sample_batch_pairs(images: int, pairs: int, generator: torch.Generator, device: torch.device) -> Tensor:
-    """(2, K) different images, all ordered pairs where no more are asked for."""
-    ordered = (~torch.eye(images, dtype=torch.bool, device=device)).nonzero()  # (B (B - 1), 2)
-    picked = torch.randperm(len(ordered), generator=generator, device=device)[:pairs]
-    return ordered[picked].T
-
-
-def _sample_non_matches(
-    config: TrainConfig, target: Tensor, batch: Batch, pair: Tensor, source: Tensor, modes: Tensor,
-    size: tuple[int, int], generator: torch.Generator,
-) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Squared distances (K, Q, N) to random places, half on the object and half off it, and which are no match.
-
-    Places, not the centres of cells: a match lies between cells, and an interpolated descriptor is the mean of four,
-    nearer to any other. Were only the matches interpolated, a network would learn that instead: a chequered grid.
-    """
-    (k, q, _), (height, width) = source.shape, target.shape[-2:]
-    on_object = F.adaptive_avg_pool2d(batch.mask.float()[:, None], (height, width))[pair[1], 0].flatten(1)  # (K, C)
-    half = config.non_matches // 2
-    drawn = [
-        torch.multinomial(weight + 1e-6, q * count, True, generator=generator).view(k, q, count)
-        for weight, count in ((on_object, half), (1 - on_object, config.non_matches - half))
-    ]
-    cell = torch.cat(drawn, -1)  # (K, Q, N)
-    corner = torch.stack([cell % width, cell // width], -1)  # (K, Q, N, 2)
-    cells = torch.tensor([width, height], device=cell.device)
-    pixels = torch.tensor(size, device=cell.device) / cells  # of a cell
-    within = torch.rand(corner.shape, generator=generator, device=cell.device)
-    position = (corner + within) * pixels - 0.5  # (K, Q, N, 2)
-    picked = sample_descriptors(target[pair[1]], position.flatten(1, 2), size).view(k, q, -1, config.descriptor_dim)
-    gap = (position[:, :, :, None] - modes[:, :, None]).square().sum(-1).amin(-1)  # (K, Q, N)
-    return (picked - source[:, :, None]).square().sum(-1), gap > (1.5 * float(pixels[0])) ** 2

@@ -11,7 +11,7 @@ import sys
 import time
 import urllib.request
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ ROOT = find_root(Path(__file__).parent)
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 CANVAS = ".mmgsd-explorer"
 PATIENCE_MS = 120_000
+VIEWPORT = {"width": 1400, "height": 1800}  # tall enough for the whole notebook
 
 
 @contextmanager
@@ -56,13 +57,22 @@ def run_lab(folder: Path) -> Iterator[str]:
 
 
 @contextmanager
-def open_explorer(address: str) -> Iterator[Any]:
-    """A page (playwright) with the notebook run to its end, the explorer showing an answer."""
-    from playwright.sync_api import Error, sync_playwright
+def open_chromium() -> Iterator[Any]:
+    """An empty page (playwright)."""
+    from playwright.sync_api import sync_playwright
 
     with sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-dev-shm-usage"])
-        page = browser.new_page(viewport={"width": 1400, "height": 1800})  # tall enough for the whole notebook
+        yield browser.new_page(viewport=VIEWPORT)
+        browser.close()
+
+
+@contextmanager
+def open_explorer(address: str, page: Any = None) -> Iterator[Any]:
+    """A page (playwright), a new one unless given, with the notebook run to its end, the explorer showing an answer."""
+    from playwright.sync_api import Error
+
+    with nullcontext(page) if page else open_chromium() as page:
         console: list[str] = []
         page.on("console", lambda message: console.append(f"{message.type}: {message.text}"))
         page.on("pageerror", lambda error: console.append(f"uncaught: {error}"))
@@ -72,12 +82,11 @@ def open_explorer(address: str) -> Iterator[Any]:
             page.get_by_text("(ipykernel) | Idle").wait_for(timeout=PATIENCE_MS)  # what is run before is lost
             _run_all(page)
             page.locator(CANVAS).wait_for(timeout=PATIENCE_MS)
-            page.get_by_text("nats").wait_for(timeout=PATIENCE_MS)  # the last cell asks about a pixel
+            page.get_by_text("nats").first.wait_for(timeout=PATIENCE_MS)  # the last cell asks about a pixel
         except Error as error:
             shown = page.locator("body").inner_text()[-4000:]
             raise AssertionError(f"{error}\nthe page: {shown}\nits console: {console[-20:]}") from error
         yield page
-        browser.close()
 
 
 def _run_all(page: Any) -> None:
@@ -94,10 +103,15 @@ def _run_all(page: Any) -> None:
             continue
 
 
+def locate(page: Any, x: float, y: float, *, side: int = 0) -> tuple[float, float]:
+    """Where a share of a picture's width and height lies on the page."""
+    box = page.locator(f"{CANVAS} .mmgsd-picture canvas").nth(side).bounding_box()
+    return box["x"] + x * box["width"], box["y"] + y * box["height"]
+
+
 def click_figure(page: Any, x: float, y: float) -> None:
-    """Click at a share of the figure's width and height."""
-    box = page.locator(CANVAS).bounding_box()
-    page.mouse.click(box["x"] + x * box["width"], box["y"] + y * box["height"])
+    """Click at a share of the left picture's width and height."""
+    page.mouse.click(*locate(page, x, y))
 
 
 def _wait_for(address: str, log: Path, *, seconds: float = 60) -> None:

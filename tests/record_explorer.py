@@ -9,10 +9,10 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from browser import CANVAS, ROOT, open_explorer, run_lab
+from browser import CANVAS, ROOT, locate, open_explorer, run_lab
 from PIL import Image
 
-CORNERS, STEPS, FRAME_MS, WIDTH_PX = [(0.236, 0.16), (0.284, 0.5), (0.164, 0.7)], 16, 140, 900
+CORNERS, STEPS, FRAME_MS, WIDTH_PX = [(0.478, 0.16), (0.575, 0.5), (0.332, 0.7)], 16, 140, 900
 
 
 def main() -> None:
@@ -21,9 +21,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder, run_lab(Path(folder)) as address, open_explorer(address) as page:
         page.get_by_role("button", name="next").click()
         page.wait_for_timeout(1000)
-        box = page.locator(CANVAS).bounding_box()
         parts = [np.linspace(a, b, STEPS) for a, b in zip(CORNERS, CORNERS[1:], strict=False)]
-        path = np.concatenate(parts) * (box["width"], box["height"]) + (box["x"], box["y"])
+        path = np.array([locate(page, *share) for share in np.concatenate(parts)])
         page.mouse.move(*path[0])
         page.mouse.down()
         page.wait_for_timeout(2000)  # the pair's descriptors are computed
@@ -33,7 +32,7 @@ def main() -> None:
         for xy in path:
             page.mouse.move(*xy)
             page.wait_for_timeout(400)
-            shot = Image.open(io.BytesIO(page.locator(CANVAS).screenshot())).convert("RGB")
+            shot = Image.open(io.BytesIO(page.locator(f"{CANVAS} .mmgsd-pictures").screenshot())).convert("RGB")
             frames.append(shot.resize((WIDTH_PX, round(shot.height * WIDTH_PX / shot.width)), Image.Resampling.LANCZOS))
         page.mouse.up()
     times = [FRAME_MS] * len(frames)

@@ -194,3 +194,11 @@ def test_clutter_hides_points_and_takes_objects_away(tiny_dataset: Callable[...,
     assert 0 < absent.float().mean() < 0.2
     assert not masks[absent].any() and not askable[absent].any()
     assert (askable.sum(1) < inside.sum(1)).any()  # something lies in front
+
+
+def test_an_absent_object_is_nobodys_match(tiny_dataset: Callable[..., Path], rng: np.random.Generator) -> None:
+    images = augmentation.load_training_images(load_dataset(tiny_dataset()), 64)
+    images = dataclasses.replace(images, present=np.array([True, False, True, True]))
+    batch = make_batch(images, np.array([0, 1]), TrainConfig(input_px=64), rng, torch.device("cpu"))
+    assert batch.inside[0].any() and not batch.inside[1].any()
+    assert batch.askable[0].any() and not batch.askable[1].any()

@@ -155,7 +155,7 @@ def test_surf_is_refused_where_opencv_lacks_it(image, mask, xy, monkeypatch):
         ({"image1": np.zeros((200, 240, 3))}, "image1 must be.*float64"),
         ({"image0": None}, "image0 must be.*NoneType"),
         ({"xy": np.zeros((2, 3))}, r"xy must be \(S, 2\) px, got shape \(2, 3\)"),
-        ({"xy": [[1, 1], [240, 10]]}, r"inside the image of 240 x 200 px, got \[240.0, 10.0\]"),
+        ({"xy": [[1, 1], [240, 10]]}, r"inside image0 of 240 x 200 px, got \(240.0, 10.0\)"),
         ({"xy": [[np.nan, 1]]}, "xy must be finite"),
         ({"mask1": np.ones((200, 240))}, "mask1 must be bool.*float64"),
         ({"mask1": np.ones((20, 24), bool)}, r"mask1 must be bool of shape \(200, 240\)"),

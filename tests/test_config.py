@@ -23,6 +23,7 @@ from mmgsd.config import (
     from_dict,
     load_preset,
     read_flag,
+    to_dict,
 )
 
 OTHER = {  # another accepted value for the fields that are no plain numbers or flags
@@ -34,12 +35,29 @@ CONFIGS = (RenderConfig(object="rope"), TrainConfig(object="rope", network="lite
 FIELDS = [(config, field.name) for config in CONFIGS for field in dataclasses.fields(config)]
 
 
-@pytest.mark.parametrize("name", ["smoke", "quick", "paper"])
+@pytest.mark.parametrize("name", ["smoke", "quick", "paper", "workspace"])
 def test_preset_configures_both_objects(name: str) -> None:
     preset = load_preset(name)
     assert preset.name == name
     for part in (preset.render, preset.train, preset.ablation):
         assert {key: value.object for key, value in part.items()} == {o: o for o in OBJECTS}
+
+
+def test_the_workspace_preset_differs_from_the_papers_in_the_scene_alone() -> None:
+    paper, workspace = load_preset("paper"), load_preset("workspace")
+    assert workspace.render == {o: dataclasses.replace(r, scene="workspace") for o, r in paper.render.items()}
+    assert workspace.train == paper.train
+
+
+def test_what_is_stored_of_a_plain_scene_is_what_was_stored_before_there_was_another() -> None:
+    stored = to_dict(RenderConfig(object="rope"))
+    assert sorted(stored) == [
+        "ball", "object", "rotation_deg", "samples", "seed", "test_images", "train_images", "views",
+    ]  # fmt: skip
+    assert from_dict(RenderConfig, stored) == RenderConfig(object="rope")
+    assert to_dict(RenderConfig(scene="workspace"))["scene"] == "workspace"
+    with pytest.raises(ValueError, match="scene must be one of 'plain', 'workspace'.*got 'workspaces'"):
+        RenderConfig(scene="workspaces")
 
 
 def test_paper_preset_has_the_papers_sizes() -> None:
@@ -118,7 +136,6 @@ def test_unknown_preset_names_the_accepted_ones() -> None:
         (TrainConfig, {"groups": 5}, "groups must be a divisor of batch and pairs"),
         (TrainConfig, {"groups": 16, "pairs": 64}, "at least 2 of 16 images"),
         (TrainConfig, {"prototype_weight": -0.5}, "prototype_weight must be at least 0, or -1"),
-        (RenderConfig, {"object": "colth"}, "did you mean 'cloth'"),
         (RenderConfig, {"object": "../towel"}, "the name of a file in data/objects"),
         (RenderConfig, {"seed": -1}, "seed must be at least 0, got -1"),
         (EvaluateConfig, {"points": 626}, "points must be between 1 and 625, got 626"),
@@ -129,6 +146,37 @@ def test_unknown_preset_names_the_accepted_ones() -> None:
 def test_wrong_value_names_argument_and_what_is_accepted(kind: type, values: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         kind(**values)
+
+
+@pytest.mark.parametrize("kind", [RenderConfig, TrainConfig])
+@pytest.mark.parametrize("name", [
+    "washcloth", "dishcloth", "ropes", "cloths", "towel2", "My_Towel", "tshirt", "cloth-blue", "a", "model", "samples",
+])  # fmt: skip
+def test_an_object_may_have_any_name_that_is_free(kind: type, name: str) -> None:
+    assert kind(object=name).object == name
+
+
+@pytest.mark.parametrize("kind", [RenderConfig, TrainConfig])
+@pytest.mark.parametrize("name", [
+    "models", "queries", "notebooks", "sample", "experiments", "Models", "Cloth", "ROPE", "cloth-spcl", "rope-broken",
+])  # fmt: skip
+def test_a_name_that_is_taken_is_refused(kind: type, name: str) -> None:
+    with pytest.raises(ValueError, match=f"object must be another name than .*'models'.* got '{name}'"):
+        kind(object=name)
+
+
+@pytest.mark.parametrize("name", ["", "a b", "a/b", "../towel", "a.json", ".hidden", "-a", "2", "a\n", "ü", "a" * 61])
+def test_a_name_that_is_none_of_a_file_is_refused(name: str) -> None:
+    with pytest.raises(ValueError, match="object must be 'cloth', 'rope' or the name of a file in data/objects: up to"):
+        RenderConfig(object=name)
+
+
+def test_nothing_that_a_preset_keeps_lies_where_an_objects_data_may() -> None:
+    paths = Paths(Path("root"), "smoke")
+    kept = (paths.model(TrainConfig()), paths.queries("cloth"))
+    for folder in {path.relative_to(paths.generated).parts[0] for path in kept}:
+        with pytest.raises(ValueError, match="another name"):
+            RenderConfig(object=folder)
 
 
 def test_unknown_key_names_the_nearest_one() -> None:

@@ -41,6 +41,11 @@ def set_cell(column: str, change: Callable[[np.ndarray], object]) -> Callable[[P
     return lambda folder: edit_labels(folder, edit)
 
 
+def set_cell_of_text(column: str, text: str) -> Callable[[Path], None]:
+    """Replaces the first row's text of a column."""
+    return lambda folder: edit_labels(folder, lambda t: t.assign(**{column: [text, *t[column].iloc[1:]]}))
+
+
 def set_info(**values: object) -> Callable[[Path], None]:
     def damage(folder: Path) -> None:
         path = folder / "dataset.json"
@@ -97,9 +102,31 @@ DAMAGES = {
     "xy not finite": (set_cell("xy", with_nan), "labels.parquet: xy holds values that are not finite"),
     "xy outside": (set_cell("xy", with_far_point), f"labels.parquet: a visible point of {MASK} lies outside"),
     "nothing visible": (set_cell("visible", lambda v: v & False), f"{MASK}: no material point is visible"),
+    "image elsewhere": (set_cell_of_text("file", "../../secret.webp"), "labels.parquet: file must be like .*secret"),
+    "image of an absolute path": (set_cell_of_text("file", "/etc/secret.webp"), "file must be like .*secret"),
+    "mask in a deeper folder": (set_cell_of_text("mask", "masks/../images/a.png"), "mask must be like"),
+    "a file twice": (set_cell_of_text("file", "images/00001.webp"), "file names a file twice"),
+    "markup as a state": (set_cell_of_text("state", "<script>"), "state must be like .*<script>"),
+    "a negative simulation": (lambda folder: edit_labels(folder, lambda t: t.assign(episode=-1)), "episode must hold"),
+    "words for numbers": (
+        lambda folder: edit_labels(folder, lambda t: t.assign(intrinsics=[["a"] * 9] * len(t))),
+        "labels.parquet: intrinsics must hold numbers",
+    ),
+    "labels of another checksum": (set_info(labels_sha256="0" * 64), "labels.parquet is damaged: its SHA-256"),
+    "markup as an object": (set_info(object="<b>"), "dataset.json: object must be a name .*'<b>'"),
+    "size of text": (set_info(size=["485", "485"]), r"dataset.json: size must be \[width, height\]"),
+    "a huge size": (set_info(size=[10**6, 10**6]), "dataset.json: size must be"),
+    "markup as a group": (set_info(symmetry={"<b>": [[0]]}), "dataset.json: symmetry must be permutations"),
+    "no permutation": (set_info(symmetry={"c4": [[0, 0]]}), "dataset.json: symmetry must be permutations"),
+    "a group that is not there": (set_info(default_group="c9"), "default_group must be one of symmetry's"),
+    "a setting that is none": (set_info(config={"views": "many"}), "dataset.json: config must be what RenderConfig"),
+    "no number of images": (set_info(images={"train": "4"}), "dataset.json: images must be the number"),
+    "markup as a version": (set_info(versions={"bpy": "<b>"}), "dataset.json: versions must be"),
+    "a mirror that is none": (set_info(mirror=[0, 0, 1]), "dataset.json: mirror must be null, or each"),
+    "a list": (lambda folder: (folder / "dataset.json").write_text("[]"), "dataset.json must hold an object with keys"),
     "another format": (set_info(format=2), "dataset.json has format 2, this version reads 1"),
     "keys missing": (drop_key, r"dataset.json lacks the keys \['symmetry'\]"),
-    "no JSON": (lambda folder: (folder / "dataset.json").write_text("{"), "dataset.json is no JSON"),
+    "no JSON": (lambda folder: (folder / "dataset.json").write_text("{"), "dataset.json is damaged or no JSON"),
     "shared simulation": (
         lambda folder: edit_labels(folder, lambda t: t.assign(episode=0)),
         r"cloth: simulations \[0\] are in both splits",
@@ -113,6 +140,41 @@ def test_damage_is_refused(tiny_dataset: Callable[..., Path], damage: Callable[[
     damage(folder)
     with pytest.raises(DatasetError, match=message):
         check_dataset(folder)
+
+
+def hide_object(folder: Path, *, mask: bool = False) -> None:
+    """Say of the first of the images that it does not show the object; its mask shows it still, if so asked."""
+    def edit(table: pd.DataFrame) -> pd.DataFrame:
+        seen = [v & (i > 0) for i, v in enumerate(table.visible)]
+        return table.assign(present=np.arange(len(table)) > 0, visible=seen)
+
+    edit_labels(folder, edit)
+    if not mask:
+        empty_mask(folder)
+
+
+def test_an_image_without_the_object_has_neither_points_nor_mask(tiny_dataset: Callable[..., Path]) -> None:
+    folder = tiny_dataset()
+    assert load_dataset(folder).present.all()
+    hide_object(folder)
+    assert check_dataset(folder).images.to_dict() == {"train": 4, "test": 2}
+    data = load_dataset(folder)
+    assert data.present.tolist() == [False, True, True, True]
+    assert len(measure_images(data)) == 3
+
+
+def test_an_image_that_shows_the_object_all_the_same_is_refused(tiny_dataset: Callable[..., Path]) -> None:
+    folder = tiny_dataset()
+    hide_object(folder, mask=True)
+    with pytest.raises(DatasetError, match=f"{MASK}: the object is said not to be present, but is seen"):
+        check_dataset(folder)
+
+
+def test_no_pair_is_of_an_image_without_the_object(rng: np.random.Generator) -> None:
+    present = np.array([True, False, True, True])
+    assert 1 not in sample_pairs(np.arange(4), 6, rng, present=present)
+    with pytest.raises(ValueError, match="at least 2 images to make a pair, got 1"):
+        sample_pairs(np.arange(2), 1, rng, present=np.array([True, False]))
 
 
 @pytest.mark.parametrize("object", ["cloth", "rope"])

@@ -58,6 +58,28 @@ def test_two_processes_have_the_losses_and_gradients_of_one(tiny_dataset: Callab
     assert (moments_of_two - moments).norm() < 0.02 * moments.norm()
 
 
+LISTENING = """
+import psutil
+from mmgsd.distributed import joined
+with joined(2, "cpu") as team:
+    team.add(1.0)
+    there = psutil.Process().net_connections("inet")
+    print("listens on", sorted({c.laddr.ip for c in there if c.status == psutil.CONN_LISTEN}), flush=True)
+    team.wait()
+"""
+
+
+def test_processes_of_one_machine_listen_on_loopback_alone(tmp_path: Path) -> None:
+    (tmp_path / "listen.py").write_text(LISTENING)
+    launch = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
+    env = {**os.environ, "PYTHONPATH": str(Path(training.__file__).parents[1]), "OMP_NUM_THREADS": "1"}
+    command = [*launch, str(tmp_path / "listen.py")]
+    done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=120)
+    said = [line for line in done.stdout.splitlines() if line.startswith("listens on")]
+    assert done.returncode == 0 and len(said) == 2, done.stderr[-2000:]
+    assert set(said) <= {"listens on ['127.0.0.1']", "listens on []"}
+
+
 def test_groups_are_shared_evenly(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("WORLD_SIZE", "2")
     with pytest.raises(ValueError, match="groups must be a multiple of the 2 processes, got 3"), joined(3, "cpu"):

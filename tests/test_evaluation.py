@@ -306,3 +306,26 @@ def test_a_point_that_sticks_out_of_the_image_is_asked_at_its_border(cloth_datas
     xy, four = np.float32([[-2.5, 120], [-0.5, 120]]), np.array([4, 4])
     outside, border = answer(0, 1, xy, four)[0].modes
     torch.testing.assert_close(outside, border)
+
+
+def test_weights_of_another_object_are_refused(cloth_dataset: Path, tmp_path: Path, untrained: Path) -> None:
+    matcher = evaluation.Matcher.load(untrained)
+    matcher.object = "rope"
+    with pytest.raises(ValueError, match="weights must be of the object 'cloth' of .*, got weights of 'rope'"):
+        evaluate_model(untrained, cloth_dataset, CONFIG, tmp_path / "out.parquet", progress=False)
+    assert not (tmp_path / "out.parquet").exists()
+    matcher.object = ""  # unknown
+    evaluate_model(untrained, cloth_dataset, CONFIG, tmp_path / "out.parquet", progress=False)
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        ({"temperature": -1.0}, "temperature must be finite and greater than 0, got -1.0"),
+        ({"temperature": float("nan")}, "temperature must be finite and greater than 0, got nan"),
+        ({"modes": 10**6}, "modes must be an integer from 1 to 64, got 1000000"),
+    ],
+)
+def test_what_cannot_be_asked(cloth_dataset: Path, tmp_path: Path, untrained: Path, asked: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        evaluate_model(untrained, cloth_dataset, CONFIG, tmp_path / "out.parquet", progress=False, **asked)

@@ -76,38 +76,96 @@ def test_the_picture_is_drawn(weights, images, capsys, tmp_path, pixels):
     [
         ({"xy": "7"}, 2, "must be column,row such as 212,148, got '7'"),
         ({"xy": "a,b"}, 2, "must be two numbers such as 212,148, got 'a,b'"),
-        ({"xy": "9000,3"}, 1, "xy must be finite and inside image0 of 300 x 200 px"),
-        ({"--n": "0"}, 2, "must be a number from 1 on, or auto, got '0'"),
-        ({"--weights": "towel"}, 1, "towel must be a safetensors file or one of 'cloth', "),
+        ({"xy": "9000,3"}, 2, "xy must be finite and inside image0 of 300 x 200 px"),
+        ({"--n": "0"}, 2, "must be a number from 1 to 64, or auto, got '0'"),
+        ({"--n": "65"}, 2, "must be a number from 1 to 64, or auto, got '65'"),
+        ({"--n": "²"}, 2, "must be a number from 1 to 64, or auto, got '²'"),
+        ({"xy": "nan,3"}, 2, "xy must be finite"),
+        ({"--weights": "."}, 2, ". is a folder"),
+        ({"--weights": __file__}, 2, "is truncated or no safetensors file"),
+        ({"--weights": "towel"}, 2, "towel must be a safetensors file or one of 'cloth', "),
         ({"--out": "match.txt"}, 2, "argument --out: must end with .png"),
-        ({"image1": "nowhere.png"}, 1, "nowhere.png"),
-        ({"image1": __file__}, 1, "is no image that can be read"),
+        ({"image1": "nowhere.png"}, 2, "nowhere.png does not exist"),
+        ({"image1": "."}, 2, ". is a folder"),
+        ({"image1": __file__}, 2, "is no image that can be read"),
     ],
 )
 def test_what_is_wrong_is_said(weights, images, capsys, changed, code, message):
     options = {"--weights": weights, **{k: v for k, v in changed.items() if k.startswith("--")}}
     words = [word for option in options.items() for word in option]
     arguments = [images[0], changed.get("image1", images[1]), "--xy", changed.get("xy", "5,5"), *words]
-    assert message in fail(capsys, code, "match", *arguments)
+    said = fail(capsys, code, "match", *arguments)
+    assert message in said
+    assert said.startswith("usage: ") or (said.startswith("error: ") and said.count("\n") == 1)
+
+
+def test_the_picture_does_not_replace_an_image(weights, images, capsys):
+    before = Path(images[0]).read_bytes()
+    said = fail(capsys, 2, "match", *images, "--xy", "5,5", "--weights", weights, "--out", images[0])
+    assert "--out must not be one of the images" in said
+    assert Path(images[0]).read_bytes() == before
+
+
+def test_a_page_holds_so_many_queries(weights, images, capsys, tmp_path):
+    asked = [word for _ in range(101) for word in ("--xy", "5,5")]
+    said = fail(capsys, 2, "match", *images, *asked, "--weights", weights, "--out", tmp_path / "m.png")
+    assert "--xy must be given at most 100 times with --out, got 101" in said
+
+
+def raising(error):
+    def stop(*_, **__):
+        raise error
+
+    return stop
+
+
+def test_ctrl_c_says_what_is_kept(weights, images, capsys, tmp_path, monkeypatch):
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", raising(KeyboardInterrupt()))
+    out = tmp_path / "new" / "m.png"
+    said = fail(capsys, 130, "match", *images, "--xy", "5,5", "--weights", weights, "--out", out)
+    assert said == f"stopped: {out} is as it was before\n"
+    assert list(out.parent.iterdir()) == []
+
+
+@pytest.mark.parametrize("what", ["picture", "network"])
+def test_a_full_disk_is_named(weights, images, capsys, tmp_path, monkeypatch, what):
+    out = tmp_path / "new" / ("m.png" if what == "picture" else "m.onnx")
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", raising(OSError(28, "No space left on device")))
+    monkeypatch.setattr("onnx.save", raising(OSError(28, "No space left on device")))
+    asked = ["match", *images, "--xy", "5,5", "--out", out] if what == "picture" else ["export", out]
+    assert f"No space left on device while writing {out}" in fail(capsys, 1, *asked, "--weights", weights)
+    assert list(out.parent.iterdir()) == []
 
 
 def test_a_command_is_asked_for(capsys):
     assert "command" in fail(capsys, 2)
 
 
-def test_onnx_gives_the_same_descriptors(weights, capsys, tmp_path):
-    path = tmp_path / "cloth.onnx"
+def test_onnx_gives_the_same_descriptors_for_any_size(weights, capsys, tmp_path):
+    path, neighbour = tmp_path / "cloth.onnx", tmp_path / "cloth.tmp"
+    neighbour.write_text("a user's own")
     assert "differ from torch's by" in run(capsys, "export", path, "--weights", weights)
     session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
-    assert session.get_modelmeta().custom_metadata_map["input_size"] == "64 64"
-    image, network = torch.rand(3, 3, 64, 64), load(weights, device="cpu").network
-    network.reduced_precision = False
-    with torch.inference_mode():
-        expected = network(image).numpy()
-    (got,) = session.run(None, {"image": image.numpy()})
-    np.testing.assert_allclose(got, expected, atol=1e-3 * np.abs(expected).max())
-    assert list(tmp_path.iterdir()) == [path]
+    metadata = session.get_modelmeta().custom_metadata_map
+    assert (metadata["input_size"], metadata["quarter_turns"], metadata["multiple_of"]) == ("64 64", "4", "8")
+    matcher = load(weights, device="cpu")
+    matcher.network.reduced_precision = False
+    for shape in ((3, 3, 64, 64), (1, 3, 56, 72), (1, 3, 120, 48)):
+        image = torch.rand(shape)
+        with torch.inference_mode():
+            expected = matcher.describe_inputs(image).numpy()
+        (got,) = session.run(None, {"image": image.numpy()})
+        np.testing.assert_allclose(got, expected, atol=1e-3 * np.abs(expected).max())
+    assert sorted(tmp_path.iterdir()) == [path, neighbour]
+    assert neighbour.read_text() == "a user's own"
+
+
+def test_nothing_is_left_of_an_export_that_differs(weights, capsys, tmp_path, monkeypatch):
+    monkeypatch.setattr("mmgsd.exporting._compare", lambda *_: 1.0)
+    said = fail(capsys, 1, "export", tmp_path / "cloth.onnx", "--weights", weights)
+    assert "descriptors differ from torch's by 1.0e+00" in said
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_onnx_needs_its_ending(weights, capsys, tmp_path):
-    assert "path must end with .onnx" in fail(capsys, 1, "export", tmp_path / "cloth.pt", "--weights", weights)
+    assert "path must end with .onnx" in fail(capsys, 2, "export", tmp_path / "cloth.pt", "--weights", weights)

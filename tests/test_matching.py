@@ -1,25 +1,26 @@
-"""Matching: heatmaps, entropy, the public Matcher's door and what its answer offers."""
+"""Matching: heatmaps, entropy, and the public Matcher's door."""
 
 from __future__ import annotations
 
 import dataclasses
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from heatmaps import CELL_PX, CELLS, CORNERS, SIZE, draw_mixture, one_cell
-from PIL import Image
-from safetensors.torch import save_file
 
 from mmgsd import matching
-from mmgsd.config import TrainConfig
-from mmgsd.matching import Match, Matcher, compute_entropy, compute_heatmap, make_match, read_image
+from mmgsd.baselines import BaselineMatcher
+from mmgsd.config import NETWORKS, TrainConfig
+from mmgsd.dataset import load_dataset
+from mmgsd.matching import Matcher, compute_entropy, compute_heatmap, load, make_match
+from mmgsd.metrics import compute_query_errors
 from mmgsd.mixture import Mixture
 from mmgsd.network import build_network, compute_cell_centres
 
 CONFIG = TrainConfig(input_px=64, descriptor_dim=8)
+ROOT = Path(__file__).parents[1]
 
 
 def test_heatmap_by_hand() -> None:
@@ -92,12 +93,6 @@ def test_the_first_image_asks_and_the_second_answers() -> None:
     assert divmod(int(heatmap.argmax()), 8) == (5, 6) and heatmap.max() > 0.99
 
 
-def save_weights(path: Path, network: torch.nn.Module, **metadata: str) -> Path:
-    stored = {"format": "mmgsd-1", "config": json.dumps(dataclasses.asdict(CONFIG)), "modes": "4", "size": "[485, 485]"}
-    save_file({k: v.contiguous() for k, v in network.state_dict().items()}, path, stored | metadata)
-    return path
-
-
 def test_match_has_the_promised_form(matcher: Matcher, rng: np.random.Generator) -> None:
     image0, image1 = (rng.integers(0, 256, (*shape, 3), dtype=np.uint8) for shape in ((90, 130), (300, 200)))
     match = matcher.match(image0, image1, xy=[(0, 0), (129, 89), (60.5, 40.25)])
@@ -133,7 +128,7 @@ def test_pixels_outside_the_source(matcher: Matcher, image: np.ndarray, bad: tup
         matcher.match(image, image, xy=[(3, 3), bad])
 
 
-@pytest.mark.parametrize("bad", [(3, 4), [(1, 2, 3)], 5])
+@pytest.mark.parametrize("bad", [(3, 4, 5), [(1, 2, 3)], 5, [[[1, 2]]]])
 def test_pixels_of_another_shape(matcher: Matcher, image: np.ndarray, bad: object) -> None:
     with pytest.raises(ValueError, match=r"xy must be \(S, 2\) px, got shape"):
         matcher.match(image, image, xy=bad)
@@ -161,51 +156,10 @@ def test_other_images(matcher: Matcher, image: np.ndarray, name: str, bad: np.nd
         matcher.match(**images, xy=[(1, 1)])
 
 
-def test_saved_weights_give_the_same_answer(matcher: Matcher, image: np.ndarray, tmp_path: Path) -> None:
-    loaded = Matcher.load(save_weights(tmp_path / "w.safetensors", matcher.network), device="cpu")
-    one, two = (m.match(image, image[::-1], xy=[(50, 60)]).modes for m in (matcher, loaded))
-    np.testing.assert_array_equal(one, two)
-    assert (loaded.config, loaded.modes, loaded.size) == (CONFIG, 4, SIZE)
-
-
-def test_missing_weights(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match="none.safetensors does not exist: train a model"):
-        Matcher.load(tmp_path / "none.safetensors")
-
-
-@pytest.mark.parametrize("kept", [0, 5, 1000, -100])
-def test_truncated_weights(matcher: Matcher, tmp_path: Path, kept: int) -> None:
-    path = save_weights(tmp_path / "w.safetensors", matcher.network)
-    path.write_bytes(path.read_bytes()[:kept])
-    with pytest.raises(ValueError, match="w.safetensors is truncated or no safetensors file"):
-        Matcher.load(path)
-
-
-def test_foreign_weights(tmp_path: Path) -> None:
-    save_file({"a": torch.zeros(1)}, tmp_path / "foreign.safetensors")
-    with pytest.raises(ValueError, match="foreign.safetensors holds no mmgsd weights: .*format None"):
-        Matcher.load(tmp_path / "foreign.safetensors")
-
-
-@pytest.mark.parametrize("changed", [{"network": "resnet34"}, {"descriptor_dim": 9}])
-def test_weights_of_another_network(matcher: Matcher, tmp_path: Path, changed: dict) -> None:
-    config = json.dumps(dataclasses.asdict(dataclasses.replace(CONFIG, **changed)))
-    path = save_weights(tmp_path / "w.safetensors", matcher.network, config=config)
-    with pytest.raises(ValueError, match="w.safetensors does not fit the network"):
-        Matcher.load(path)
-
-
 def test_contrastive_weights_have_a_bandwidth(matcher: Matcher) -> None:
     config = dataclasses.replace(CONFIG, method="pcl", margin=2.0)
     assert Matcher(matcher.network, config, modes=1, size=SIZE, device="cpu").bandwidth == 0.5
     assert matcher.bandwidth is None
-
-
-def test_weights_carry_their_temperature(matcher: Matcher, image: np.ndarray, tmp_path: Path) -> None:
-    path = save_weights(tmp_path / "w.safetensors", matcher.network, temperature="2.5")
-    assert (Matcher.load(path, device="cpu").temperature, matcher.temperature) == (2.5, 1.0)
-    calm, sure = (m.match(image, image[::-1], xy=[(50, 60)]) for m in (Matcher.load(path, device="cpu"), matcher))
-    np.testing.assert_allclose(calm.cells, sure.cells**0.4 / (sure.cells**0.4).sum(), rtol=1e-3)
 
 
 def test_the_number_of_modes_may_be_given_or_found(matcher: Matcher, image: np.ndarray) -> None:
@@ -214,66 +168,137 @@ def test_the_number_of_modes_may_be_given_or_found(matcher: Matcher, image: np.n
     assert ((found.weights > 0).sum(1) >= 1).all()
 
 
-def answer(cells: torch.Tensor, n: int | str) -> Match:
-    """What a matcher with these heatmaps answers."""
+@pytest.mark.parametrize("bad", [-1.0, 0, float("nan"), float("inf"), "1", True])
+@pytest.mark.parametrize("name", ["bandwidth", "temperature"])
+def test_a_scale_is_finite_and_positive(matcher: Matcher, name: str, bad: object) -> None:
+    for ask in (
+        lambda: compute_heatmap(torch.ones(1, 4), **{name: bad}),
+        lambda: Matcher(matcher.network, CONFIG, modes=4, size=SIZE, device="cpu", **{name: bad}),
+    ):
+        with pytest.raises(ValueError, match=f"{name} must be finite and greater than 0, got {bad!r}"):
+            ask()
+
+
+@pytest.mark.parametrize("bad", [0, -1, 10**6, True, 2.0, "4", None])
+def test_a_model_has_a_number_of_modes(matcher: Matcher, bad: object) -> None:
+    with pytest.raises(ValueError, match=f"modes must be an integer from 1 to 64, got {bad!r}"):
+        Matcher(matcher.network, CONFIG, modes=bad, size=SIZE, device="cpu")
+
+
+@pytest.mark.parametrize("bad", [(485,), (485, 485, 3), (0, 485), (-1, -1), (10**9, 485), (485.0, 485), "ab", None])
+def test_a_model_has_a_size(matcher: Matcher, bad: object) -> None:
+    with pytest.raises(ValueError, match="size must be .width, height., two whole numbers of 16 to 65536 px, got"):
+        Matcher(matcher.network, CONFIG, modes=4, size=bad, device="cpu")
+
+
+def test_fewer_modes_are_the_most_probable_of_the_groups(matcher: Matcher, image: np.ndarray) -> None:
+    pair = matcher.prepare(image, image[::-1])
+    every, fewer = pair.match([(50, 60), (9, 9)]), pair.match([(50, 60), (9, 9)], n=2)
+    np.testing.assert_array_equal(fewer.modes, every.modes[:, :2])
+    np.testing.assert_array_equal(fewer.covariances, every.covariances[:, :2])
+    np.testing.assert_allclose(fewer.weights, every.weights[:, :2] / every.weights[:, :2].sum(1, keepdims=True))
+    np.testing.assert_array_equal(fewer.outside, every.outside)
+
+
+def test_each_query_may_have_its_number_of_modes(matcher: Matcher, image: np.ndarray) -> None:
+    pair = matcher.prepare(image, image[::-1])
+    match, every = (pair.match([(50, 60), (9, 9), (20, 7)], n=n) for n in (np.array([1, 3, 6]), None))
+    assert (match.weights > 0).sum(1).tolist() == [1, 3, 6]
+    assert np.isfinite(match.modes).all(-1).sum(1).tolist() == [1, 3, 6]
+    np.testing.assert_allclose(match.weights.sum(1), 1, rtol=1e-5)
+    np.testing.assert_allclose(match.modes[0, 0], every.modes[0, 0], atol=1e-3)
+
+
+def test_one_mode_of_four_is_not_their_middle() -> None:
+    cells = draw_mixture(CORNERS, 12.0, np.array([0.4, 0.2, 0.2, 0.2]))
     blank = np.zeros((485, 485, 3), np.uint8)
     centres = compute_cell_centres(SIZE, (CELLS, CELLS))
-    return make_match(blank, blank, np.zeros((len(cells), 2), np.float32), cells, centres, n)
+    match = make_match(blank, blank, np.zeros((1, 2), np.float32), cells, centres, 1, fitted=4)
+    np.testing.assert_allclose(match.modes[0], CORNERS[:1], atol=1)
 
 
-def test_best_is_the_narrowest_mode() -> None:
-    std = np.array([30.0, 12.0, 20.0, 25.0])
-    best = answer(draw_mixture(CORNERS, std), 4).best()
-    np.testing.assert_allclose(best.xy, CORNERS[[1]], atol=0.5)
-    np.testing.assert_allclose(best.spread_px, np.hypot(12, CELL_PX / np.sqrt(6)), rtol=0.02)
+@pytest.mark.parametrize("bad", [0, -3, 65, 10**30, True, [True], 2.0, [1, 2, 3], "4", "many", {}, float("nan")])
+def test_another_number_of_modes(matcher: Matcher, image: np.ndarray, bad: object) -> None:
+    with pytest.raises(ValueError, match="^n must be"):
+        matcher.match(image, image, xy=[(5, 5)], n=bad)
 
 
-def test_best_of_as_many_as_there_are() -> None:
-    best = answer(torch.cat([draw_mixture(CORNERS[:1], 12.0), draw_mixture(CORNERS[1:], 12.0)]), "auto").best()
-    assert np.isfinite(best.xy).all()
-    np.testing.assert_allclose(best.xy[0], CORNERS[0], atol=0.1)
+def test_images_keep_their_aspect(matcher: Matcher) -> None:
+    shapes = [(485, 485), (364, 485), (485, 364), (970, 970), (400, 100)]
+    grids = [tuple(d.shape[1:]) for d in matcher.describe([np.zeros((*shape, 3), np.uint8) for shape in shapes])]
+    assert grids == [(16, 16), (14, 18), (18, 14), (16, 16), (48, 12)]
 
 
-def test_confidence_is_the_mass_near_a_mode() -> None:
-    for std in (10.0, 20.0, 40.0):
-        match = answer(draw_mixture(CORNERS[:1] + 140, std), 1)
-        x, y = np.meshgrid(*(np.arange(485) - c for c in match.modes[0, 0]))
-        near = match.heatmap[0][np.hypot(x, y) <= 20].sum()
-        assert match.confidence(radius_px=20)[0, 0] == pytest.approx(near, abs=0.01)
+def test_images_of_several_aspects_are_described_as_each_alone(matcher: Matcher, rng: np.random.Generator) -> None:
+    images = [rng.integers(0, 256, (*shape, 3), dtype=np.uint8) for shape in ((90, 130), (200, 150), (180, 260))]
+    for together, image in zip(matcher.describe(images), images, strict=True):
+        torch.testing.assert_close(together, matcher.describe([image])[0], atol=0.02, rtol=0.05)
 
 
-def test_four_equal_modes_are_as_sure_as_one() -> None:
-    one, four = (answer(draw_mixture(CORNERS[:n], 16.0), n).confidence() for n in (1, 4))
-    np.testing.assert_allclose(four, np.full((1, 4), one[0, 0]), atol=0.01)
+@pytest.mark.parametrize("name", ["image0", "image1"])
+def test_a_narrow_strip_is_refused(matcher: Matcher, image: np.ndarray, name: str) -> None:
+    images = {"image0": image, "image1": image} | {name: np.zeros((40, 4000, 3), np.uint8)}
+    with pytest.raises(ValueError, match=f"{name} must be at most 16 times as long as wide, got 4000 x 40 px"):
+        matcher.match(**images, xy=[(1, 1)])
 
 
-def test_a_weak_mode_is_less_sure() -> None:
-    match = answer(draw_mixture(CORNERS[:2], 8.0, np.array([0.9, 0.1])), 2)
-    confidence = match.confidence(radius_px=100)[0]
-    np.testing.assert_allclose(confidence, [1, 0.2], atol=0.01)
+@pytest.mark.parametrize("network", NETWORKS)
+@pytest.mark.parametrize("shape", [(40, 640), (500, 33), (1, 1)])
+def test_long_and_small_images_are_answered(network: str, shape: tuple[int, int]) -> None:
+    torch.manual_seed(0)
+    config = dataclasses.replace(CONFIG, input_px=128, network=network)
+    matcher = Matcher(build_network(network, 8, pretrained=False), config, modes=2, size=SIZE, device="cpu")
+    image = np.zeros((*shape, 3), np.uint8)
+    assert np.isfinite(matcher.match(image, image, (0, 0)).modes).all()
 
 
-def test_best_abstains_where_it_is_not_sure_enough() -> None:
-    match = answer(torch.cat([draw_mixture(CORNERS[:1], 6.0), draw_mixture(CORNERS[:1], 60.0)]), 1)
-    best = match.best(min_confidence=0.5)
-    assert np.isfinite(best.xy[0]).all() and np.isnan(best.xy[1]).all()
-    assert best.confidence[0] > 0.5 > best.confidence[1]
+@pytest.mark.parametrize(("name", "size", "squeezed_px"), [("cloth", (485, 364), 36.4), ("rope", (480, 480), 20.5)])
+def test_cropped_images_are_answered_about_as_well_as_whole_ones(
+    name: str, size: tuple[int, int], squeezed_px: float
+) -> None:
+    whole, cropped = (measure_sample(name, size) for size in ((9999, 9999), size))
+    assert cropped < 1.2 * whole
+    assert cropped < 0.9 * squeezed_px
 
 
-def test_best_of_nothing() -> None:
-    assert answer(one_cell(3, 3)[:0], 4).best().xy.shape == (0, 2)
+def measure_sample(name: str, size: tuple[int, int]) -> float:
+    """Mean RMSE (px) of the shipped model about sample images, each cropped to at most ``size`` around the object."""
+    data, pair_errors = load_dataset(ROOT / "data" / "sample" / name, "test"), []
+    matcher, points, group = load(name, device="cpu"), np.arange(0, 625, 25), data.group()
+    size = np.minimum(size, data.size)
+    centres = [np.ptp(xy[seen], 0) / 2 + xy[seen].min(0) for xy, seen in zip(data.xy, data.visible, strict=True)]
+    corners = [np.clip(c - size / 2, 0, np.array(data.size) - size).astype(int) for c in centres]
+    crops = [data.load_image(k)[y : y + size[1], x : x + size[0]] for k, (x, y) in enumerate(corners)]
+    pairs = [matcher.prepare(crops[k], crops[(k + step) % len(crops)]) for step in (1, 3) for k in range(len(crops))]
+    for number, pair in enumerate(pairs):
+        first = number % len(crops)
+        second = (first + (1, 3)[number // len(crops)]) % len(crops)
+        xy = data.xy[first, points] - corners[first]
+        true = data.xy[second][group.permutations[:, points].T] - corners[second]  # (S, G, 2)
+        inside = ((true >= 0) & (true < size - 1)).all((1, 2)) & ((xy >= 0) & (xy < size - 1)).all(1)
+        asked = inside & data.visible[first, points]
+        match = pair.match(xy[asked])
+        pair_errors.append(compute_query_errors(match.modes, match.covariances, true[asked])["rmse_px"])
+    return float(np.concatenate(pair_errors).mean())
 
 
-@pytest.mark.parametrize(("name", "bad"), [("min_confidence", 1.1), ("min_confidence", -1), ("radius_px", 0)])
-def test_best_of_other_arguments(name: str, bad: float) -> None:
-    with pytest.raises(ValueError, match=f"{name} must be .*, got {bad}"):
-        answer(one_cell(3, 3), 1).best(**{name: bad})
+def test_what_the_caller_changes_later_does_not_change_the_answer(matcher: Matcher, image: np.ndarray) -> None:
+    image1, xy = image.copy(), np.float32([[5, 5]])
+    for match in (matcher.match(image, image1, xy), BaselineMatcher("sift").match(image, image1, xy)):
+        before = match.image1.copy(), match.xy.copy()
+        image1 ^= 255
+        xy += 1
+        np.testing.assert_array_equal(match.image1, before[0])
+        np.testing.assert_array_equal(match.xy, before[1])
+        xy -= 1
 
 
-def test_photographs_are_read_upright(tmp_path: Path) -> None:
-    shown = np.zeros((4, 6, 3), np.uint8)
-    shown[0] = 255
-    exif = Image.Exif()
-    exif[0x0112] = 6  # stored turned: to be turned by 90° clockwise when shown
-    Image.fromarray(np.rot90(shown)).save(tmp_path / "photo.png", exif=exif)
-    np.testing.assert_array_equal(read_image(tmp_path / "photo.png"), shown)
+def test_a_pair_of_numbers_is_one_query(matcher: Matcher, image: np.ndarray) -> None:
+    one, same = (matcher.match(image, image, xy=xy) for xy in ((50, 60), [(50, 60)]))
+    np.testing.assert_array_equal(one.modes, same.modes)
+
+
+def test_damaged_descriptors_give_no_answer(matcher: Matcher, image: np.ndarray) -> None:
+    cells = torch.full((1, 8, 8), torch.nan)
+    with pytest.raises(ValueError, match="heatmap must be finite, got NaN or infinity"):
+        make_match(image, image, np.zeros((1, 2)), cells, compute_cell_centres((160, 120), (8, 8)), 4)

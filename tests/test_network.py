@@ -15,6 +15,7 @@ from mmgsd.network import (
     build_network,
     compute_cell_centres,
     compute_input_size,
+    fit_input_size,
     sample_descriptors,
 )
 
@@ -148,6 +149,24 @@ def test_unknown_network() -> None:
 )
 def test_input_size(size: tuple[int, int], input_px: int, expected: tuple[int, int]) -> None:
     assert compute_input_size(size, input_px) == expected
+
+
+@pytest.mark.parametrize(
+    ("size", "trained", "expected"),
+    [
+        ((970, 970), (485, 485), (128, 128)),
+        ((1280, 960), (640, 480), (128, 96)),
+        ((485, 364), (485, 485), (144, 112)),
+        ((364, 485), (485, 485), (112, 144)),
+        ((480, 640), (640, 480), (96, 128)),
+        ((4800, 300), (485, 485), (768, 48)),
+        ((900, 20), (900, 20), (128, 16)),  # what was taught stays what it is
+    ],
+)
+def test_an_input_has_the_images_own_aspect(
+    size: tuple[int, int], trained: tuple[int, int], expected: tuple[int, int]
+) -> None:
+    assert fit_input_size(size, trained, 128) == expected
 
 
 def test_cell_centres() -> None:

@@ -15,6 +15,7 @@ import pytest
 from mmgsd import packing
 from mmgsd.config import OBJECTS
 from mmgsd.dataset import check_dataset, load_dataset
+from mmgsd.files import ForeignFileError, LockedError, locked
 from mmgsd.packing import LABEL_STEP, pack_dataset, unpack_dataset, write_sample
 
 SAMPLE = Path(__file__).resolve().parents[1] / "data" / "sample"
@@ -64,6 +65,59 @@ def test_files_of_no_data_set_are_refused(archive: Path, tmp_path: Path, name: s
     with pytest.raises(ValueError, match="which is no file of a data set"):
         unpack_dataset(archive, tmp_path / "folder" / "back")
     assert not list(tmp_path.rglob("evil*"))
+
+
+def repack(archive: Path, change: Callable[[zipfile.ZipFile], None], **said: object) -> None:
+    """Add to an archive, and have its note say so."""
+    with zipfile.ZipFile(archive, "a") as target:
+        change(target)
+    note = json.loads(archive.with_suffix(".json").read_text())
+    note |= {"sha256": packing.hashlib.sha256(archive.read_bytes()).hexdigest(), **said}
+    archive.with_suffix(".json").write_text(json.dumps(note))
+
+
+def test_an_archive_that_unpacks_to_more_than_its_note_says_is_refused(archive: Path, tmp_path: Path) -> None:
+    zeros = bytes(50_000_000)
+    repack(archive, lambda zip: zip.writestr("images/bomb.webp", zeros, zipfile.ZIP_DEFLATED))
+    with pytest.raises(ValueError, match="holds 'images/bomb.webp' compressed"):
+        unpack_dataset(archive, tmp_path / "back")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["cloth.json", "cloth.zip"]
+
+
+@pytest.mark.parametrize(
+    ("name", "message"), [("images/more.webp", "files, and by its note these should be"), (None, "unpacks to")]
+)
+def test_an_archive_holds_what_its_note_says(archive: Path, tmp_path: Path, name: str | None, message: str) -> None:
+    if name:
+        repack(archive, lambda zip: zip.writestr(name, b"x"), bytes=10**9)
+    else:
+        repack(archive, lambda zip: None, bytes=10)
+    with pytest.raises(ValueError, match=message):
+        unpack_dataset(archive, tmp_path / "back")
+
+
+def test_files_of_others_are_not_replaced(
+    tiny_dataset: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(packing, "SAMPLE", {"train": 2, "test": 1})
+    (tmp_path / "sample").mkdir()
+    for name in ("thesis.zip", "sample/photo.webp"):
+        (tmp_path / name).write_text("mine")
+    folder = tiny_dataset()
+    with pytest.raises(ForeignFileError, match="thesis.zip has no note beside it"):
+        pack_dataset(folder, tmp_path / "thesis.zip", progress=False)
+    with pytest.raises(ForeignFileError, match="sample is not empty and no data set"):
+        write_sample(folder, tmp_path / "sample")
+    assert [(tmp_path / name).read_text() for name in ("thesis.zip", "sample/photo.webp")] == ["mine", "mine"]
+    (tmp_path / "sample" / "photo.webp").unlink()
+    for _ in range(2):  # into an empty folder, then over itself
+        assert write_sample(folder, tmp_path / "sample") == tmp_path / "sample"
+    assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
+
+
+def test_what_is_in_use_is_not_packed_or_sampled(cloth_dataset: Path, tmp_path: Path) -> None:
+    with locked(tmp_path / "a.zip", "packing"), pytest.raises(LockedError, match="a.zip is in use by process"):
+        pack_dataset(cloth_dataset, tmp_path / "a.zip", progress=False)
 
 
 def test_bad_arguments(archive: Path, cloth_dataset: Path, tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -58,10 +60,34 @@ def test_ellipse_follows_the_covariance():
     assert abs(direction @ vectors[:, 1]) == pytest.approx(1)
 
 
-@pytest.mark.parametrize("index", [-1, 1])
+@pytest.mark.parametrize("index", [-1, 1, 0.5, "0", None, True])
 def test_plot_match_names_the_accepted_index(index):
     with pytest.raises(ValueError, match=r"index must be in \[0, 1\)"):
         plots.plot_match(make_match(), index)
+
+
+@pytest.mark.parametrize(("queries", "rows"), [(1, 1), (2, 1), (5, 3)])
+def test_a_page_has_two_queries_a_row(queries, rows):
+    figure = plots.plot_page(make_match(queries))
+    drawn = [axis for axis in figure.axes if axis.images]
+    assert len(drawn) == 2 * queries
+    assert figure.axes[0].get_gridspec().nrows == rows
+    assert drawn[-2].get_title().startswith(f"{queries} · pixel ")
+
+
+def test_a_page_shows_large_images_small_and_the_modes_where_they_are():
+    match = make_match()
+    large = dataclasses.replace(match, image1=np.zeros((4000, 6000, 3), np.uint8), modes=100 * match.modes)
+    axis = plots.plot_page(large).axes[1]
+    assert axis.images[0].get_array().shape[:2] == (427, 640)
+    np.testing.assert_allclose(axis.patches[0].center, (large.modes[0, 0] + 0.5) * (640 / 6000) - 0.5, rtol=0.01)
+
+
+@pytest.mark.parametrize("queries", [0, 101])
+def test_a_page_holds_so_many_queries(queries):
+    match = make_match(1)[np.zeros(queries, int)]
+    with pytest.raises(ValueError, match=f"match must hold 1 to 100 queries to be drawn, got {queries}"):
+        plots.plot_page(match)
 
 
 def test_plot_teaser_has_three_panels_a_match():

@@ -13,11 +13,13 @@ from pathlib import Path
 
 import psutil
 import pytest
+from batches import run_child
 from dask.distributed import LocalCluster
 
 from mmgsd import rendering
 from mmgsd.config import RenderConfig
 from mmgsd.dataset import check_dataset, load_dataset
+from mmgsd.files import ForeignFileError, LockedError, locked, write_json
 from mmgsd.rendering import RenderError, plan_batches, render_batch, render_dataset
 
 CONFIG = RenderConfig(object="rope", train_images=3, test_images=2, views=1, samples=1, seed=5)
@@ -34,11 +36,11 @@ rendering.render_dataset(config, Path(sys.argv[1]), progress=False, **how)
 """
 
 
-def start(folder: Path, workers: int, scheduler: str = "") -> subprocess.Popen:
+def start(folder: Path, workers: int, scheduler: str = "", temporary: Path | None = None) -> subprocess.Popen:
     script = folder.parent / "render.py"
     script.write_text(SCRIPT)
     path = str(Path(rendering.__file__).resolve().parents[1])
-    env = {**os.environ, "PYTHONPATH": path}
+    env = {**os.environ, "PYTHONPATH": path, **({"TMPDIR": str(temporary)} if temporary else {})}
     command = [sys.executable, str(script), str(folder), str(workers), scheduler]
     return subprocess.Popen(command, env=env, start_new_session=True)
 
@@ -125,9 +127,10 @@ def wait_for_rendering_worker(pids: set[int]) -> int:
 
 
 def test_a_folder_begun_with_another_configuration_is_not_mixed(tmp_path: Path) -> None:
-    rendering._claim(CONFIG, tmp_path)
+    partial = tmp_path / "rope.partial"
+    write_json(partial / "config.json", rendering._describe(CONFIG))
     with pytest.raises(ValueError, match="samples: 1 there, 2 asked for"):
-        rendering._claim(dataclasses.replace(CONFIG, samples=2), tmp_path)
+        render_dataset(dataclasses.replace(CONFIG, samples=2), tmp_path / "rope", progress=False)
 
 
 def test_a_failing_child_says_why() -> None:
@@ -147,6 +150,16 @@ def test_images_of_an_older_kind_of_cloth_are_not_taken_for_todays(tiny_dataset:
     assert render_dataset(config, folder) == folder
 
 
+def test_a_workspace_is_another_data_set_and_a_plain_one_is_described_as_ever(tmp_path: Path) -> None:
+    assert rendering._describe(CONFIG) == {
+        "object": "rope", "train_images": 3, "test_images": 2, "views": 1, "samples": 1, "rotation_deg": 180.0,
+        "ball": False, "seed": 5, "scenes": 1,
+    }  # fmt: skip
+    rendering._claim(CONFIG, tmp_path)
+    with pytest.raises(ValueError, match="scene: 'plain' there, 'workspace' asked for"):
+        rendering._claim(dataclasses.replace(CONFIG, scene="workspace"), tmp_path)
+
+
 def test_an_object_without_a_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"objects/sock\.json does not exist"):
         render_dataset(dataclasses.replace(CONFIG, object="sock"), tmp_path / "sock", progress=False)
@@ -164,3 +177,172 @@ def test_a_changed_object_is_another_data_set(tmp_path: Path, monkeypatch: pytes
     file.write_text('{"outline": [[0, 0], [4, 0], [4, 3], [0, 3]], "symmetry": "turns"}')
     with pytest.raises(ValueError, match="scenes: .* there, .* asked for"):
         render_dataset(config, folder, progress=False)
+
+
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Batches are drawn in milliseconds, without Blender; the list names the jobs' splits in turn."""
+    asked: list[str] = []
+    monkeypatch.setattr(rendering, "IMAGES_A_BATCH", 1)
+
+    def draw(job: dict, folder: Path) -> tuple[int, str]:
+        asked.append(job["split"])
+        return run_child(job, folder)
+
+    monkeypatch.setattr(rendering, "_run_child", draw)
+    return asked
+
+
+def render(folder: Path, **how: object) -> Path:
+    return render_dataset(CONFIG, folder, progress=False, workers=1, **how)
+
+
+@pytest.mark.parametrize("name", ["only_test", "overwrite", "progress"])
+def test_flags_are_read_before_anything_is_touched(drawn: list[str], tmp_path: Path, name: str) -> None:
+    with pytest.raises(ValueError, match=f"{name} must be true or false .*got 'perhaps'"):
+        render_dataset(CONFIG, tmp_path / "rope", **{name: "perhaps"})
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_notebooks_false_is_false(drawn: list[str], tmp_path: Path) -> None:
+    before = read_tree(render(tmp_path / "rope"))
+    drawn.clear()
+    render(tmp_path / "rope", overwrite="false")
+    assert not drawn and read_tree(tmp_path / "rope") == before
+
+
+@pytest.mark.parametrize("workers", ["4", True, 1.5, -1])
+def test_the_number_of_workers_is_a_number(tmp_path: Path, workers: object) -> None:
+    with pytest.raises(ValueError, match="workers must be"):
+        render_dataset(CONFIG, tmp_path / "rope", workers=workers)
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+@pytest.mark.parametrize("name", ["images/holiday.webp", "thesis.odt", "deeper/labels.parquet"])
+def test_a_folder_of_others_is_left_as_it_is(drawn: list[str], tmp_path: Path, name: str, overwrite: bool) -> None:
+    (tmp_path / "rope" / name).parent.mkdir(parents=True)
+    (tmp_path / "rope" / name).write_text("mine")
+    with pytest.raises(ForeignFileError, match="rope.* is (not empty|none)"):
+        render(tmp_path / "rope", overwrite=overwrite)
+    assert read_tree(tmp_path) == {f"rope/{name}": b"mine"} and not drawn
+
+
+def test_a_foreign_file_among_the_images_keeps_a_set_from_being_replaced(drawn: list[str], tmp_path: Path) -> None:
+    before = read_tree(render(tmp_path / "rope"))
+    (tmp_path / "rope" / "images" / "holiday.webp").write_text("mine")
+    with pytest.raises(ForeignFileError, match="holiday.webp is none of this project's files"):
+        render(tmp_path / "rope", overwrite=True)
+    assert read_tree(tmp_path / "rope") == {**before, "images/holiday.webp": b"mine"}
+    (tmp_path / "rope" / "images" / "holiday.webp").unlink()
+    render(tmp_path / "rope", overwrite=True)
+    assert read_tree(tmp_path / "rope") == before and os.listdir(tmp_path) == ["rope"]
+
+
+def test_foreign_files_beside_the_batches_are_named(drawn: list[str], tmp_path: Path) -> None:
+    (tmp_path / "rope.partial").mkdir()
+    (tmp_path / "rope.partial" / "notes.txt").write_text("mine")
+    with pytest.raises(ForeignFileError, match="notes.txt is none of this project's files"):
+        render(tmp_path / "rope", overwrite=True)
+
+
+def test_a_folder_that_is_being_rendered_is_in_use_and_a_finished_one_can_be_read(
+    drawn: list[str], tmp_path: Path
+) -> None:
+    with locked(tmp_path / "rope", "rendering"), pytest.raises(LockedError, match=f"in use by process {os.getpid()}"):
+        render(tmp_path / "rope")
+    render(tmp_path / "rope")
+    with locked(tmp_path / "rope", "rendering"):
+        assert len(load_dataset(render(tmp_path / "rope"))) == 3
+
+
+@pytest.mark.parametrize("damage", [
+    lambda data: b"", lambda data: data[:-40], lambda data: data[:200] + bytes([data[200] ^ 1]) + data[201:],
+    lambda data: b"no zip", lambda data: data[:-5] + b"other",
+])  # fmt: skip
+def test_a_damaged_batch_is_rendered_again_and_the_others_are_kept(
+    drawn: list[str], tmp_path: Path, damage: Callable[[bytes], bytes]
+) -> None:
+    whole = read_tree(render(tmp_path / "whole"))
+    render(tmp_path / "rope", only_test=True)
+    drawn.clear()
+    batch = tmp_path / "rope.partial" / "test_000001.zip"
+    batch.write_bytes(damage(batch.read_bytes()))
+    with pytest.warns(UserWarning, match="test_000001.zip is damaged, so it is made again"):
+        render(tmp_path / "rope")
+    assert sorted(drawn) == ["test", "train", "train", "train"]
+    assert read_tree(tmp_path / "rope") == whole
+
+
+@pytest.mark.parametrize("claim", [b"", b"{", b"[]", b"\xff"])
+def test_batches_are_known_again_by_their_marks_where_the_claim_is_damaged(
+    drawn: list[str], tmp_path: Path, claim: bytes
+) -> None:
+    render(tmp_path / "rope", only_test=True)
+    (tmp_path / "rope.partial" / "config.json").write_bytes(claim)
+    drawn.clear()
+    with pytest.warns(UserWarning, match="config.json is damaged"):
+        render(tmp_path / "rope")
+    assert drawn == ["train"] * 3
+
+
+def test_a_killed_child_is_said_to_be_killed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rendering, "_run_child", lambda job, folder: (-signal.SIGKILL, ""))
+    with pytest.raises(RenderError, match="ended by SIGKILL: memory may be short, so try fewer workers"):
+        render_batch(next(iter(plan_batches(CONFIG).values())))
+
+
+def test_stopping_says_what_is_kept_and_the_next_call_goes_on(
+    drawn: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stop(*_: object) -> Path:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(rendering, "_assemble", stop)
+    with pytest.raises(KeyboardInterrupt, match="5 of 5 batches are kept in .*rope.partial"):
+        render(tmp_path / "rope")
+    monkeypatch.undo()
+    monkeypatch.setattr(rendering, "IMAGES_A_BATCH", 1)
+    assert len(load_dataset(render(tmp_path / "rope"))) == 3 and len(drawn) == 5
+
+
+def test_nothing_listens_beyond_this_machine_while_it_renders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    listening: set[str] = set()
+
+    def look(job: dict, folder: Path) -> tuple[int, str]:
+        there = psutil.Process().net_connections("inet")
+        listening.update(c.laddr.ip for c in there if c.status == psutil.CONN_LISTEN)
+        return run_child(job, folder)
+
+    monkeypatch.setattr(rendering, "_run_child", look)
+    render(tmp_path / "rope")
+    assert listening <= {"127.0.0.1", "::1"}
+
+
+@pytest.mark.parametrize(("cores", "quota", "expected"), [(64, (400000, 100000), 4), (2, (None, None), 2)])
+def test_as_many_children_as_cores_that_may_be_used(
+    monkeypatch: pytest.MonkeyPatch, cores: int, quota: tuple, expected: int
+) -> None:
+    import dask.system
+
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(cores)))
+    monkeypatch.setattr(dask.system.psutil.Process, "cpu_affinity", lambda self: list(range(cores)))
+    monkeypatch.setattr(dask.system, "_try_extract_cgroup_cpu_quota", lambda: quota)
+    assert rendering.cpu_count() == expected
+
+
+def test_children_and_their_temporary_folders_go_with_a_killed_parent(tmp_path: Path) -> None:
+    temporary = tmp_path / "tmp"
+    temporary.mkdir()
+    process = start(tmp_path / "rope", 1, temporary=temporary)
+    deadline, children = time.monotonic() + 120, []
+    while not children and time.monotonic() < deadline:
+        children = [c for c in psutil.Process(process.pid).children(recursive=True) if "mmgsd.scene" in c.cmdline()]
+        time.sleep(0.02)
+    time.sleep(1)  # past its first imports
+    process.kill()
+    process.wait()
+    gone, alive = psutil.wait_procs(children, timeout=20)
+    assert gone and not alive
+    assert [path.name for path in temporary.glob(".mmgsd-batch*")]
+    with rendering.scratch_folder(temporary, "mmgsd-batch"):
+        assert len(list(temporary.glob(".mmgsd-batch*"))) == 1

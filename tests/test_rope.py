@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from mmgsd.scene import rope_shape
+from mmgsd.scene import SceneError, rope_shape
 from mmgsd.scene.rope_shape import LENGTH, STATES, OwnPart, RopeShape, find_crossings, resample, sample_rope
 
 SEEDS = 60
@@ -97,6 +97,13 @@ def test_thickness_varies(ropes: list[RopeShape]) -> None:
     assert thickness.min() < 0.035 < 0.042 < thickness.max()
 
 
+@pytest.mark.parametrize("state", STATES)
+def test_a_thin_cable_is_as_possible_as_a_rope(state: str) -> None:
+    shape = sample_rope(np.random.default_rng(2), state=state, slenderness=(150, 150))
+    assert rope_shape.is_possible(shape) and shape.state == state
+    assert 1 / 175 < shape.thickness / LENGTH < 1 / 120
+
+
 def test_find_crossings_of_a_bow() -> None:
     pairs, angles = find_crossings(np.array([[0.0, 0.0], [2.0, 2.0], [2.0, 0.0], [0.0, 2.0]]))
     assert pairs.tolist() == [[0, 2]]
@@ -108,6 +115,15 @@ def test_resample_keeps_ends_and_spacing() -> None:
     points = resample(np.column_stack([np.cos(angle), np.sin(angle), 0 * angle]), 101)
     assert points[0] == pytest.approx([1, 0, 0]) and points[-1] == pytest.approx([-1, 0, 0], abs=1e-9)
     assert np.linalg.norm(np.diff(points, axis=0), axis=1) == pytest.approx(np.pi / 100, rel=1e-3)
+
+
+@pytest.mark.parametrize(("name", "nothing"), [("_sample_plan", lambda *_: None), ("is_possible", lambda _: False)])
+def test_a_rope_that_never_lies_well_is_given_up(monkeypatch: pytest.MonkeyPatch, name: str, nothing: object) -> None:
+    monkeypatch.setattr(rope_shape, name, nothing)
+    monkeypatch.setattr(rope_shape, "relax", lambda points, *_: points)
+    monkeypatch.setattr(rope_shape, "SETTLED", 3)
+    with pytest.raises(SceneError, match="'bent'.* 50000 curves were drawn, or 3 suitable ones settled"):
+        sample_rope(np.random.default_rng(0), state="bent")
 
 
 def test_unknown_state_is_an_error() -> None:

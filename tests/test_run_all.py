@@ -1,26 +1,43 @@
-"""The whole experiment through papermill, as a user runs it: from another folder, and with a wrong preset."""
+"""Notebooks through papermill, as a user runs them: from another folder, with wrong parameters, and all of them."""
 
 import subprocess
 import sys
 from pathlib import Path
 
-RUN_ALL = Path(__file__).resolve().parents[1] / "notebooks" / "run_all.ipynb"
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
 
 
-def run_papermill(folder: Path, *parameters: str) -> subprocess.CompletedProcess:
-    command = [sys.executable, "-m", "papermill", "--kernel", "python3", str(RUN_ALL), "out.ipynb", *parameters]
+def run_papermill(folder: Path, *parameters: str, notebook: str = "run_all") -> subprocess.CompletedProcess:
+    source = ROOT / "notebooks" / f"{notebook}.ipynb"
+    command = [sys.executable, "-m", "papermill", "--kernel", "python3", str(source), "out.ipynb", *parameters]
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=1200)
 
 
-def test_a_wrong_preset_stops_at_once_with_the_accepted_ones(tmp_path: Path) -> None:
-    done = run_papermill(tmp_path, "-p", "preset", "papr")
+@pytest.mark.parametrize(
+    ("notebook", "name", "value", "said"),
+    [
+        ("run_all", "preset", "papr", "'smoke', 'quick', 'paper'"),
+        ("run_all", "presett", "quick", "presett is no parameter of this notebook"),
+        ("01_render_data", "overwrite", "flase", "overwrite must be true or false"),
+    ],
+)
+def test_a_wrong_parameter_stops_at_once(tmp_path: Path, notebook: str, name: str, value: str, said: str) -> None:
+    done = run_papermill(tmp_path, "-p", name, value, notebook=notebook)
     assert done.returncode != 0
-    assert "'smoke', 'quick', 'paper'" in done.stderr + done.stdout
+    assert said in done.stderr + done.stdout
 
 
 def test_the_smoke_experiment_runs_from_any_folder_and_draws_every_figure(tmp_path: Path) -> None:
     done = run_papermill(tmp_path)
     assert done.returncode == 0, done.stderr[-3000:]
-    drawn = {path.name for path in (RUN_ALL.parents[1] / "figures" / "smoke").iterdir()}
+    drawn = {path.name for path in (ROOT / "figures" / "smoke").iterdir()}
     names = ("teaser", "combined", "rmse_pdf", "spatial_rmse", "sigma_ablation", "risk_coverage", "calibration")
     assert {f"{name}.{kind}" for name in names for kind in ("pdf", "png")} <= drawn
+    rendered = ROOT / "data" / "generated" / "smoke" / "cloth" / "dataset.json"
+    before = rendered.stat()
+    done = run_papermill(tmp_path, "-p", "overwrite", "false", notebook="01_render_data")
+    assert done.returncode == 0, done.stderr[-3000:]
+    after = rendered.stat()
+    assert (after.st_mtime_ns, after.st_ino) == (before.st_mtime_ns, before.st_ino)

@@ -14,7 +14,7 @@ from scipy.ndimage import binary_erosion, distance_transform_edt
 bpy = pytest.importorskip("bpy")
 
 from mmgsd.config import RenderConfig, find_root  # noqa: E402
-from mmgsd.scene import cloth, episode, randomize, render  # noqa: E402
+from mmgsd.scene import SceneError, cloth, episode, randomize, render, textures  # noqa: E402
 from mmgsd.sheet import load_sheet  # noqa: E402
 
 SIZE = (485, 485)
@@ -118,6 +118,26 @@ def test_crossings_count_a_flap_pushed_through_the_cloth():
     grid[0, 0] = grid[10, 10] + (0.3 * cloth.SPACING, 0.3 * cloth.SPACING, -0.05)  # its neighbours stay above
     grid[0, 1, 2] = grid[1, 0, 2] = grid[1, 1, 2] = 0.05
     assert cloth.count_crossings(vertices, cloth.grid_faces(cloth.SIDE)) > 0
+
+
+def test_a_cloth_that_never_comes_to_lie_is_given_up_with_the_reasons(monkeypatch):
+    results = iter([cloth.flat_vertices() * factor for factor in ((1, 1, np.nan), (2, 2, 1))] * 99)
+    monkeypatch.setattr(cloth, "_simulate", lambda *_: next(results))
+    monkeypatch.setattr(cloth, "STARTS", 2)
+    with pytest.raises(SceneError, match="cloth did not .*'flat' in 2 starts with 3 .*nowhere 3 times, stretched.* 3"):
+        cloth.deform(np.random.default_rng(0), "flat")
+
+
+@pytest.mark.parametrize("place", [np.nan, np.inf])
+def test_points_that_no_camera_sees_are_given_up(place):
+    points = np.full((4, 3), place)
+    with pytest.raises(SceneError, match="none of 1000 cameras saw 95%"), np.errstate(invalid="ignore"):
+        randomize.draw_camera(np.random.default_rng(0), points, SIZE, 45.0)
+
+
+def test_a_colour_further_away_than_any_is_given_up():
+    with pytest.raises(SceneError, match="none of 1000 colours"):
+        textures.draw_contrasting(np.random.default_rng(0), (0.5, 0.5, 0.5, 1.0), distance=2.0, exempt=0.0)
 
 
 def test_unknown_split_and_state_are_named():

@@ -9,9 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from safetensors.numpy import save_file
 
 from mmgsd.config import TrainConfig, find_root
 from mmgsd.dataset import load_dataset
+from mmgsd.files import ForeignFileError, LockedError, locked
 from mmgsd.matching import Matcher, load
 from mmgsd.shipping import restore_model, ship_model
 from mmgsd.training import train_model
@@ -43,6 +45,27 @@ def test_half_precision_gives_the_same_answers(tiny_dataset: Callable[..., Path]
     assert restore_model(shipped, weights.parent, config).read_bytes() != shipped.read_bytes()  # trained here: kept
     with pytest.raises(ValueError, match="train that one"):
         restore_model(shipped, tmp_path / "other", dataclasses.replace(config, seed=1))
+
+
+def test_files_of_others_are_not_replaced(cloth_dataset: Path, tmp_path: Path) -> None:
+    config = TrainConfig(steps=1, batch=2, pairs=2, queries=8, input_px=64, descriptor_dim=4)
+    weights = train_model(config, cloth_dataset, tmp_path / "model", progress=False)
+    out = tmp_path / "cloth.safetensors"
+    save_file({"a": np.zeros(3)}, out)
+    with pytest.raises(ForeignFileError, match="cloth.safetensors holds no weights of this project"):
+        ship_model(weights, out, FACTS)
+    out.unlink()
+    out.with_suffix(".md").write_text("# Diary")
+    with pytest.raises(ForeignFileError, match="cloth.md is no card of cloth.safetensors"):
+        ship_model(weights, out, FACTS)
+    assert not out.exists()
+    out.with_suffix(".md").unlink()
+    shipped = ship_model(weights, out, FACTS)
+    weights.write_bytes(weights.read_bytes()[:999])
+    with pytest.warns(UserWarning, match="weights.safetensors is damaged, so it is made again"):
+        assert restore_model(shipped, weights.parent, config).read_bytes() == shipped.read_bytes()
+    with locked(tmp_path / "model", "training"), pytest.raises(LockedError, match="model is in use"):
+        restore_model(shipped, tmp_path / "model", config)
 
 
 @pytest.mark.parametrize("card", CARDS, ids=[card.stem for card in CARDS])

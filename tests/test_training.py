@@ -19,15 +19,16 @@ from safetensors import safe_open
 from safetensors.torch import load_file
 
 from mmgsd import training
+from mmgsd.checkpoints import check_enough
 from mmgsd.config import METHODS, TrainConfig
-from mmgsd.dataset import load_dataset
+from mmgsd.dataset import hold_out, load_dataset
+from mmgsd.files import LockedError, locked
 from mmgsd.matching import Matcher
+from mmgsd.objective import compute_loss, compute_sigma
 from mmgsd.training import (
     CHECKPOINT,
     LOG,
     compute_learning_rate,
-    compute_loss,
-    compute_sigma,
     load_metadata,
     load_training_images,
     make_batch,
@@ -139,9 +140,56 @@ def test_overwrite_trains_again_to_the_same_weights(cloth_dataset: Path, tmp_pat
     first = train(ONE_STEP, cloth_dataset, tmp_path / "model").read_bytes()
     (tmp_path / "model" / "stale").touch()
     second = load_file(train(ONE_STEP, cloth_dataset, tmp_path / "model", overwrite=True))
-    assert not (tmp_path / "model" / "stale").exists()
+    assert (tmp_path / "model" / "stale").exists()  # none of what training writes
     (tmp_path / "first.safetensors").write_bytes(first)
     torch.testing.assert_close(second, load_file(tmp_path / "first.safetensors"), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("how", [{"overwrite": "perhaps"}, {"progress": "si"}, {"validate_every": "2"}])
+def test_options_are_read_before_anything_is_touched(cloth_dataset: Path, tmp_path: Path, how: dict) -> None:
+    with pytest.raises(ValueError, match=f"{next(iter(how))} must be"):
+        train_model(ONE_STEP, cloth_dataset, tmp_path / "model", **how)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_is_trained_in_once_at_a_time(cloth_dataset: Path, tmp_path: Path) -> None:
+    with locked(tmp_path / "model", "training"), pytest.raises(LockedError, match="model is in use by process"):
+        train(ONE_STEP, cloth_dataset, tmp_path / "model")
+    weights = train(ONE_STEP, cloth_dataset, tmp_path / "model")
+    with locked(tmp_path / "model", "training"):  # what is finished is only read
+        assert train(ONE_STEP, cloth_dataset, tmp_path / "model", overwrite="false") == weights
+    assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
+
+
+def test_too_few_images_are_said_before_training(cloth_dataset: Path, tmp_path: Path) -> None:
+    data = load_dataset(cloth_dataset)
+    alone = dataclasses.replace(data, labels=data.labels.drop_duplicates("episode").reset_index(drop=True))
+    with pytest.raises(ValueError, match="at least 2 training images of each simulation, or 30 simulations of one view "
+                                         "each, .* got 3 images of 3 simulations"):  # fmt: skip
+        check_enough(alone, hold_out(alone)[1])
+
+
+def test_a_failing_calibration_costs_no_training(
+    cloth_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> float:
+        raise RuntimeError("no calibration")
+
+    monkeypatch.setattr(training, "calibrate_temperature", fail)
+    with pytest.raises(RuntimeError, match="no calibration"):
+        train(ONE_STEP, cloth_dataset, tmp_path / "model")
+    monkeypatch.undo()
+    monkeypatch.setattr(training._Run, "advance", fail)  # all steps are done
+    assert train(ONE_STEP, cloth_dataset, tmp_path / "model").is_file()
+
+
+def test_stopping_says_what_is_kept(cloth_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def stop(run: training._Run) -> float:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(training._Run, "learn", lambda run, group: stop(run))
+    with pytest.raises(KeyboardInterrupt, match="stopped after step 0; nothing is kept yet"):
+        train(TINY, cloth_dataset, tmp_path / "model")
 
 
 def test_training_starts_from_trained_weights(cloth_dataset: Path, tmp_path: Path) -> None:

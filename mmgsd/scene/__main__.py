@@ -1,17 +1,22 @@
 """Child process that renders one job: ``python -m mmgsd.scene < job.json``.
 
 The job holds ``config`` (the fields of ``RenderConfig``), ``split``, ``episodes`` as [[episode, views], …], ``sheet``
-(None, or the object as `Sheet.to_dict` gives it) and ``out``, the archive to write. Blender lives here alone: its
-memory goes with the process, and its chatter stays out of the parent's output. The exit code is 1 after an exception,
-its traceback on stderr.
+(None, or the object as `Sheet.to_dict` gives it), ``out``, the archive to write, and where it is known ``mark``, which
+the archive keeps, and ``parent``, the process with which this one ends. Blender lives here alone: its memory goes with
+the process, and its chatter stays out of the parent's output. The exit code is 1 after an exception, its traceback on
+stderr.
 """
 
 from __future__ import annotations
 
+import ctypes
 import io
 import json
 import os
+import signal
 import sys
+import threading
+import time
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,14 +26,18 @@ from typing import Any
 from PIL import Image
 
 from mmgsd.config import RenderConfig, from_dict
+from mmgsd.files import writing
 from mmgsd.sheet import Sheet
 
 WEBP = {"lossless": True, "quality": 20, "method": 0}  # 25 ms an image; more effort saves a few per cent of space
+PR_SET_PDEATHSIG = 1  # of Linux: which signal a process gets when its parent ends
 
 
 def main() -> None:
     """Read a job from stdin and render it."""
     job = json.load(sys.stdin)
+    if "parent" in job:
+        end_with(job["parent"])
     with silenced():
         render_job(job)
 
@@ -44,19 +53,30 @@ def render_job(job: dict[str, Any]) -> Path:
 
     sheet = Sheet.from_dict(job["sheet"]) if job.get("sheet") else None
     config, out = from_dict(RenderConfig, job["config"]), Path(job["out"])
-    aside = out.with_name(f".{out.name}.{os.getpid()}")
-    try:
-        with zipfile.ZipFile(aside, "w", zipfile.ZIP_STORED) as archive:
-            labels = []
-            for episode, n_views in job["episodes"]:
-                for i, view in enumerate(render_episode(config, job["split"], episode, n_views, sheet)):
-                    written = write_view(archive, episode, i, view)
-                    labels.append({"episode": episode, "view": i, "split": job["split"], **written})
-            _add(archive, "labels.json", json.dumps(labels).encode())
-        os.replace(aside, out)
-    finally:
-        aside.unlink(missing_ok=True)
+    with writing(out) as aside, zipfile.ZipFile(aside, "w", zipfile.ZIP_STORED) as archive:
+        archive.comment, labels = job.get("mark", "").encode(), []
+        for episode, n_views in job["episodes"]:
+            for i, view in enumerate(render_episode(config, job["split"], episode, n_views, sheet)):
+                written = write_view(archive, episode, i, view)
+                labels.append({"episode": episode, "view": i, "split": job["split"], **written})
+        _add(archive, "labels.json", json.dumps(labels).encode())
     return out
+
+
+def end_with(parent: int) -> None:
+    """End this process with its parent, however that ends: nobody would take what it renders."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    else:
+        threading.Thread(target=_watch, args=(parent,), daemon=True).start()
+    if os.getppid() != parent:  # it has ended before
+        os._exit(1)
+
+
+def _watch(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(1)
+    os._exit(1)
 
 
 def write_view(archive: zipfile.ZipFile, episode: int, index: int, view: Any) -> dict[str, Any]:

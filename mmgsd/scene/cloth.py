@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -11,8 +13,10 @@ import numpy as np
 from mathutils.bvhtree import BVHTree
 
 from mmgsd.config import RenderConfig
+from mmgsd.meshes import SPACING
+from mmgsd.scene import SceneError
 from mmgsd.scene.render import DeformedObject, add_mesh, read_vertices
-from mmgsd.sheet import SPACING, Sheet
+from mmgsd.sheet import Sheet
 from mmgsd.symmetry import grid_group
 
 SIDE = 37  # simulated vertices a side; with 49 a frame takes nearly twice as long
@@ -22,6 +26,7 @@ VISIBILITY_RADIUS = 0.004  # m; less than the distance that self-collision keeps
 STATES = {"flat": 0.10, "wrinkled": 0.24, "folded": 0.26, "folded twice": 0.10, "corner": 0.20, "crumpled": 0.10}
 SETTLE_FRAMES = 8
 ATTEMPTS = 3  # at a move, before the cloth starts anew
+STARTS = 100  # of one cloth at most; a crumpled T-shirt or towel takes two on average
 MAX_STRETCH = 1.22  # of the 99th percentile of edges
 MAX_HEIGHT = 0.17  # m
 MAX_CROSSINGS = 9  # pairs of quads, of 1296, that cut each other: more are seen as spots of the other layer
@@ -40,9 +45,10 @@ def build_cloth(rng: np.random.Generator, config: RenderConfig) -> DeformedObjec
 
     The 625 points are (25, 25) row-major vertices of the rendered surface itself; 1 m a side.
     """
+    sheet = draw_rectangle(rng) if config.scene == "workspace" else square_sheet()
     state = str(rng.choice(list(STATES), p=list(STATES.values())))
-    vertices, frames = deform(rng, state)
-    return hand_over(vertices, {"state": state, "physics_frames": frames})
+    vertices, frames = deform(rng, state, sheet)
+    return hand_over(vertices, {"state": state, "physics_frames": frames}, sheet)
 
 
 def build_sheet(rng: np.random.Generator, sheet: Sheet) -> DeformedObject:
@@ -54,33 +60,44 @@ def build_sheet(rng: np.random.Generator, sheet: Sheet) -> DeformedObject:
     return DeformedObject(mesh, points, VISIBILITY_RADIUS, {"state": state, "physics_frames": frames})
 
 
-def hand_over(vertices: np.ndarray, info: dict[str, str | float | int]) -> DeformedObject:
-    """Add simulated vertices (1369, 3) m to the scene as a smooth cloth lying on the floor."""
-    mesh = _add_rendered(vertices, square_sheet())
+def hand_over(
+    vertices: np.ndarray, info: dict[str, str | float | int], sheet: Sheet | None = None
+) -> DeformedObject:
+    """Add simulated vertices (1369, 3) m of the square or a rectangle to the scene as a smooth cloth on the floor."""
+    mesh = _add_rendered(vertices, sheet or square_sheet())
     grid = read_vertices(mesh.data)[_order_row_major(mesh.data)]  # (73, 73, 3)
     return DeformedObject(mesh, grid[::3, ::3].reshape(-1, 3), VISIBILITY_RADIUS, info)
 
 
 def deform(rng: np.random.Generator, state: str, sheet: Sheet | None = None) -> tuple[np.ndarray, int]:
-    """Simulate one state of ``STATES`` of a sheet (None: the square cloth): vertices (V, 3) m, and physics frames."""
+    """Simulate one state of ``STATES`` of a sheet (None: the square cloth): vertices (V, 3) m, and physics frames.
+
+    ValueError for another state; SceneError, which counts why, where the sheet never comes to lie in it.
+    """
     if state not in STATES:
         raise ValueError(f"state must be one of {', '.join(STATES)}, got {state!r}")
-    sheet, frames = sheet or square_sheet(), 0
-    while True:
+    sheet, frames, faults = sheet or square_sheet(), 0, Counter()
+    for _ in range(STARTS):
         vertices = _rippled(rng, sheet, 0.001 if state == "flat" else 0.008)
         for move in _MOVES[state]:
-            vertices, count = _perform(rng, sheet, vertices, move)
+            vertices, count = _perform(rng, sheet, vertices, move, faults)
             frames += count
             if vertices is None:
                 break
         else:
             return vertices, frames
+    reasons = ", ".join(f"{fault} {count} times" for fault, count in faults.most_common())
+    raise SceneError(f"{sheet.name} did not come to lie in the state {state!r} in {STARTS} starts with {ATTEMPTS} "
+                     f"attempts at a move each: it ended {reasons}")  # fmt: skip
 
 
 def _perform(
-    rng: np.random.Generator, sheet: Sheet, start: np.ndarray, move: tuple[Plan, ...]
+    rng: np.random.Generator, sheet: Sheet, start: np.ndarray, move: tuple[Plan, ...], faults: Counter[str]
 ) -> tuple[np.ndarray | None, int]:
-    """The vertices after a move, None where it failed too often, and the frames of physics that all attempts took."""
+    """The vertices after a move, None where it failed too often, and the frames of physics that all attempts took.
+
+    ``faults`` counts why attempts failed.
+    """
     frames = 0
     for _ in range(ATTEMPTS):
         vertices = start.copy()
@@ -88,18 +105,26 @@ def _perform(
             grasps, count = plan(rng, vertices)
             vertices = _simulate(sheet, vertices, grasps, count)
             frames += count
-        if _is_plausible(sheet, vertices):
+        if not (fault := _find_fault(sheet, vertices)):
             return vertices, frames
+        faults[fault] += 1
     return None, frames
 
 
-def _is_plausible(sheet: Sheet, vertices: np.ndarray) -> bool:
-    """Whether the cloth came to lie, hardly stretched and hardly cutting through itself."""
+def _find_fault(sheet: Sheet, vertices: np.ndarray) -> str:
+    """How a cloth lies that is no good; empty where it lies hardly stretched and hardly cutting through itself."""
+    if not np.isfinite(vertices).all():
+        return "nowhere"
     sides = np.sort(np.stack([sheet.faces, np.roll(sheet.faces, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
     a, b = np.unique(sides, axis=0).T
     now, at_rest = (np.linalg.norm(points[a] - points[b], axis=-1) for points in (vertices, sheet.rest))
-    stretched, high = np.quantile(now / at_rest, 0.99) > MAX_STRETCH, np.ptp(vertices[:, 2]) >= MAX_HEIGHT
-    return not stretched and not high and count_crossings(vertices, sheet.faces) <= MAX_CROSSINGS
+    if np.quantile(now / at_rest, 0.99) > MAX_STRETCH:
+        return f"stretched to more than {MAX_STRETCH:g} of its length"
+    if np.ptp(vertices[:, 2]) >= MAX_HEIGHT:
+        return f"{MAX_HEIGHT:g} m high or higher"
+    if count_crossings(vertices, sheet.faces) > MAX_CROSSINGS:
+        return f"cutting through itself at more than {MAX_CROSSINGS} places"
+    return ""
 
 
 def count_crossings(vertices: np.ndarray, faces: np.ndarray) -> int:
@@ -121,6 +146,13 @@ def flat_vertices() -> np.ndarray:
 def square_sheet() -> Sheet:
     """The simulated square cloth."""
     return Sheet("cloth", flat_vertices(), grid_faces(SIDE), grid_group("c4", side=SIDE))
+
+
+def draw_rectangle(rng: np.random.Generator) -> Sheet:
+    """The square cloth, or one that is a little or much longer than wide: its points are those of the square."""
+    square = square_sheet()
+    width = rng.choice([1.0, rng.uniform(0.93, 1.0), rng.uniform(0.55, 0.9)], p=[0.6, 0.25, 0.15])
+    return dataclasses.replace(square, rest=square.rest * (width, 1.0, 1.0))
 
 
 def _rippled(rng: np.random.Generator, sheet: Sheet, height: float) -> np.ndarray:
@@ -309,9 +341,12 @@ def grid_faces(side: int) -> np.ndarray:
 def _add_rendered(vertices: np.ndarray, sheet: Sheet) -> bpy.types.Object:
     """A smooth static mesh lying on z = 0: of the square cloth's, 73 × 73 vertices."""
     coarse = add_mesh("cloth coarse", vertices, sheet.faces)
-    if sheet is square_sheet():  # textures in its own coordinates; they have a square's symmetry
+    if sheet.name == "cloth":  # textures in its own coordinates; they have a square's symmetry
         rest = coarse.data.attributes.new("rest", "FLOAT_VECTOR", "POINT")
-        rest.data.foreach_set("vector", (sheet.rest / EXTENT).astype(np.float32).ravel())
+        rest.data.foreach_set("vector", (flat_vertices() / EXTENT).astype(np.float32).ravel())
+    face = coarse.data.attributes.new("face", "FLOAT_VECTOR", "POINT")  # for pictures: 0 to 1 over the sheet
+    low, high = sheet.rest.min(axis=0), sheet.rest.max(axis=0)
+    face.data.foreach_set("vector", ((sheet.rest - low) / np.maximum(high - low, 1e-9)).astype(np.float32).ravel())
     subdivision = coarse.modifiers.new("subdivision", "SUBSURF")
     subdivision.levels = 1
     mesh = bpy.data.meshes.new_from_object(coarse.evaluated_get(bpy.context.evaluated_depsgraph_get()))

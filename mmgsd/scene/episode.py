@@ -7,7 +7,7 @@ import zlib
 import bpy
 import numpy as np
 
-from mmgsd.config import OBJECTS, RenderConfig
+from mmgsd.config import OBJECTS, SCENES, RenderConfig
 from mmgsd.scene import randomize, render
 from mmgsd.scene.render import DeformedObject, View
 from mmgsd.sheet import Sheet
@@ -25,13 +25,18 @@ def render_episode(
     if split not in SPLITS:
         raise ValueError(f"split must be one of {', '.join(SPLITS)}, got {split!r}")
     kind = OBJECTS.index(config.object) if sheet is None else zlib.crc32(sheet.name.encode())
-    rng = np.random.default_rng([config.seed, kind, SPLITS.index(split), episode])
+    around = [SCENES.index(config.scene)] if config.scene != "plain" else []  # the plain scene's stream is as it was
+    rng = np.random.default_rng([config.seed, kind, SPLITS.index(split), episode, *around])
     scene = render.reset_scene()
     deformed = build_object(rng, config, sheet)
-    floor = add_floor()
     size = config.size if sheet is None else sheet.size
     render.setup_cycles(scene, size, config.samples)
     bvh = render.build_bvh(deformed.mesh)
+    if config.scene == "workspace":
+        from mmgsd.scene.workspace import render_view
+
+        return [render_view(rng, config, size, scene, deformed, bvh) for _ in range(n_views)]
+    floor = add_floor()
     return [_render_view(rng, config, size, scene, deformed, floor, bvh) for _ in range(n_views)]
 
 

@@ -22,7 +22,13 @@ PHOTOGRAPHS = (
     "ihc.png", "motorcycle_left.png", "page.png", "retina.jpg", "rocket.jpg", "text.png", "color.png",
 )  # fmt: skip
 
+TABLES = (
+    (196, 154, 108), (160, 110, 66), (222, 188, 140), (110, 72, 46), (240, 240, 238), (225, 225, 228), (200, 200, 200),
+    (150, 152, 156), (100, 102, 106), (60, 62, 66), (24, 24, 26), (176, 164, 146), (60, 90, 70), (58, 78, 120),
+)  # fmt: skip
+
 Bytes = tuple[int, int, int]
+Draw = Callable[[np.random.Generator], Bytes]
 Paint = Callable[[np.random.Generator, Bytes], np.ndarray]
 
 
@@ -38,10 +44,19 @@ def draw_paint(rng: np.random.Generator) -> Bytes:
     return as_bytes(draw_colour(rng))
 
 
-def draw_other(rng: np.random.Generator, other: Bytes, *, distance: float = 60.0) -> Bytes:
+def draw_table(rng: np.random.Generator) -> Bytes:
+    """A colour as tables and floors have them: wood, white, grey, black, or any."""
+    if rng.random() < 0.4:
+        return draw_paint(rng)
+    return vary_paint(rng, TABLES[rng.integers(len(TABLES))], 0.12)
+
+
+def draw_other(
+    rng: np.random.Generator, other: Bytes, *, distance: float = 60.0, draw: Draw = draw_paint
+) -> Bytes:
     """A colour at least ``distance`` (of 255) away from another, of a bounded number of draws."""
     for _ in range(20):
-        colour = draw_paint(rng)
+        colour = draw(rng)
         if np.linalg.norm(np.subtract(colour, other)) >= distance:
             return colour
     return tuple(255 - c if abs(255 - 2 * c) > 40 else 0 for c in other)
@@ -244,7 +259,8 @@ def _draw_motif(rng: np.random.Generator, pen: ImageDraw.ImageDraw, centre: np.n
     elif kind == "ring":
         pen.ellipse(box, outline=colour, width=max(1, int(reach / 3)))
     elif kind == "polygon":
-        pen.regular_polygon((x, y, max(1.0, reach)), int(rng.integers(3, 8)), rotation=int(rng.integers(360)), fill=colour)
+        circle, turn = (x, y, max(1.0, reach)), int(rng.integers(360))
+        pen.regular_polygon(circle, int(rng.integers(3, 8)), rotation=turn, fill=colour)
     elif kind == "cross":
         pen.rectangle([x - reach, y - reach / 3, x + reach, y + reach / 3], fill=colour)
         pen.rectangle([x - reach / 3, y - reach, x + reach / 3, y + reach], fill=colour)

@@ -6,6 +6,7 @@ import bpy
 import numpy as np
 from mathutils import Euler, Vector
 
+from mmgsd.scene import SceneError
 from mmgsd.scene.render import Camera
 from mmgsd.scene.textures import (
     BACKGROUNDS,
@@ -19,6 +20,7 @@ from mmgsd.scene.textures import (
 
 MIN_SPAN = 0.8  # m seen across the image at least: a small heap stays small
 MAX_OUTSIDE = 0.05  # share of the material points that may fall out of the image
+POSES = 1000  # drawn for one view at most
 
 
 # Camera. ------------------------------------------------------------------------------------------------------------
@@ -27,13 +29,18 @@ MAX_OUTSIDE = 0.05  # share of the material points that may fall out of the imag
 def draw_camera(
     rng: np.random.Generator, points: np.ndarray, size: tuple[int, int], rotation_deg: float
 ) -> tuple[Camera, float]:
-    """A camera above points (N, 3) m, and the angle (degrees in ±rotation_deg) by which it turns the image."""
+    """A camera above points (N, 3) m, and the angle (degrees in ±rotation_deg) by which it turns the image.
+
+    SceneError where no camera sees nearly all points.
+    """
     turn = rng.uniform(-rotation_deg, rotation_deg)
-    while True:
+    for _ in range(POSES):
         camera = _draw_pose(rng, points, size, np.radians(turn))
         outside = 1 - camera.contains(camera.project(points)).mean()
         if outside <= MAX_OUTSIDE:
             return camera, float(turn)
+    raise SceneError(f"none of {POSES} cameras saw {1 - MAX_OUTSIDE:.0%} of the points, which reach from "
+                     f"{points.min(axis=0).round(2).tolist()} to {points.max(axis=0).round(2).tolist()} m")  # fmt: skip
 
 
 def _draw_pose(rng: np.random.Generator, points: np.ndarray, size: tuple[int, int], turn: float) -> Camera:
@@ -65,18 +72,19 @@ def draw_light(rng: np.random.Generator, scene: bpy.types.Scene) -> None:
     exposure, ambient = np.exp(rng.normal(scale=0.22)), rng.uniform(0.25, 0.75)
     tint = rng.normal(scale=0.06)  # warm to cold
     colour = np.clip([1 + tint, 1.0, 1 - tint], 0, 2)
-    _set_world(scene, (*np.clip([1 - tint, 1, 1 + tint], 0, 2), 1.0), exposure * ambient)
+    set_world(scene, (*np.clip([1 - tint, 1, 1 + tint], 0, 2), 1.0), exposure * ambient)
     elevation, azimuth = rng.uniform(np.radians(30), np.radians(85)), rng.uniform(0, 2 * np.pi)
     towards = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
     radiance = exposure * (1 - ambient) / np.sin(elevation)  # of a white sheet
-    lamp, distance = _new_lamp(rng, scene)
+    lamp, distance = _draw_lamp(rng, scene)
     lamp.data.color = colour
     lamp.data.energy = radiance * np.pi * (np.pi * distance**2 if lamp.data.type == "AREA" else 1.0)
     lamp.location = distance * towards
     lamp.rotation_euler = Vector(towards).to_track_quat("Z", "Y").to_euler()
 
 
-def _set_world(scene: bpy.types.Scene, colour: Colour, strength: float) -> None:
+def set_world(scene: bpy.types.Scene, colour: Colour, strength: float) -> None:
+    """Light of one colour from all around, as bright as ``strength`` on a white sheet."""
     if scene.world is None:
         scene.world = bpy.data.worlds.new("world")
         scene.world.use_nodes = True
@@ -84,20 +92,26 @@ def _set_world(scene: bpy.types.Scene, colour: Colour, strength: float) -> None:
     background.inputs["Color"].default_value, background.inputs["Strength"].default_value = colour, strength
 
 
-def _new_lamp(rng: np.random.Generator, scene: bpy.types.Scene) -> tuple[bpy.types.Object, float]:
+def _draw_lamp(rng: np.random.Generator, scene: bpy.types.Scene) -> tuple[bpy.types.Object, float]:
     """The scene's only lamp, replaced, and its distance from the origin in m."""
+    if rng.random() < 0.5:
+        lamp = new_lamp(scene, "SUN")
+        lamp.data.angle = np.radians(np.exp(rng.uniform(np.log(0.5), np.log(40.0))))
+    else:
+        lamp = new_lamp(scene, "AREA")
+        lamp.data.size = rng.uniform(0.2, 2.0)
+    return lamp, float(rng.uniform(1.8, 4.0))
+
+
+def new_lamp(scene: bpy.types.Scene, kind: str) -> bpy.types.Object:
+    """Replace the scene's only lamp by a ``SUN`` or an ``AREA``."""
     if "lamp" in bpy.data.objects:
         bpy.data.lights.remove(bpy.data.objects["lamp"].data)  # takes the object with it
-    if rng.random() < 0.5:
-        data = bpy.data.lights.new("lamp", "SUN")
-        data.angle = np.radians(np.exp(rng.uniform(np.log(0.5), np.log(40.0))))
-    else:
-        data = bpy.data.lights.new("lamp", "AREA")
-        data.size = rng.uniform(0.2, 2.0)
+    data = bpy.data.lights.new("lamp", kind)
     data.cycles.use_multiple_importance_sampling = False  # sampled directly alone: less noise on matt surfaces
     lamp = bpy.data.objects.new("lamp", data)
     scene.collection.objects.link(lamp)
-    return lamp, float(rng.uniform(1.8, 4.0))
+    return lamp
 
 
 # Materials. -----------------------------------------------------------------------------------------------------------

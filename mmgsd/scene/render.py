@@ -23,6 +23,8 @@ import numpy as np
 from mathutils import Matrix, Vector
 from mathutils.bvhtree import BVHTree
 
+from mmgsd.files import scratch_folder
+
 MASK_PASS = "object"  # the shader output that is 1 on the object and 0 elsewhere
 GPU_BACKENDS = ("OPTIX", "CUDA", "HIP", "METAL")
 
@@ -153,8 +155,8 @@ def place_camera(scene: bpy.types.Scene, camera: Camera) -> None:
 def render_image(scene: bpy.types.Scene, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Render the scene: image (H, W, 3) uint8 sRGB, and mask (H, W) bool of pixels at least half object."""
     scene.cycles.seed = seed
-    with tempfile.TemporaryDirectory(dir=_memory_folder()) as folder:
-        path = Path(folder) / "view.exr"
+    with scratch_folder(_memory_folder(), "mmgsd-view") as folder:
+        path = folder / "view.exr"
         scene.render.filepath = str(path)
         bpy.ops.render.render(write_still=True)
         channels = read_exr(path)
@@ -164,9 +166,9 @@ def render_image(scene: bpy.types.Scene, seed: int) -> tuple[np.ndarray, np.ndar
     return encode_srgb(linear), mask
 
 
-def _memory_folder() -> str | None:
+def _memory_folder() -> Path:
     """A folder in memory where the system has one: these files live for milliseconds."""
-    return "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
+    return Path("/dev/shm" if os.access("/dev/shm", os.W_OK) else tempfile.gettempdir())
 
 
 def encode_srgb(linear: np.ndarray) -> np.ndarray:

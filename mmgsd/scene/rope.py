@@ -6,6 +6,7 @@ alike, and a coloured strand runs the whole length. Only the optional ball break
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import bpy
@@ -15,9 +16,10 @@ from mmgsd.config import N_POINTS, RenderConfig
 from mmgsd.scene.render import DeformedObject, add_mesh
 from mmgsd.scene.rope_shape import LENGTH, OwnPart, RopeShape, resample, sample_rope
 
-RINGS = {"laid": 480, "braided": 400}  # cross-sections of a strand
-SIDES = {"laid": 8, "braided": 6}  # corners of a cross-section
+RINGS = {"laid": 480, "braided": 400, "cable": 480}  # cross-sections of a strand
+SIDES = {"laid": 8, "braided": 6, "cable": 12}  # corners of a cross-section
 OVERHANG = 0.25  # how far the strands reach beyond the first and last material point, in diameters
+SLENDER = 150 / 32  # times the usual rope's least length in diameters, at most, in a workspace
 OWN_ARC = 2.0  # a hit this near along the rope, in diameters, is the material point's own surface
 MAIN, ACCENT, BALL = 0, 1, 2  # what a face belongs to; slots are numbered by what is there
 
@@ -26,13 +28,16 @@ MAIN, ACCENT, BALL = 0, 1, 2  # what a face belongs to; slots are numbered by wh
 class Lay:
     """How the strands run around the centre line; lengths in diameters of the rope."""
 
-    kind: str  # laid: twisted one way; braided: as many each way, over and under in turn
+    kind: str  # laid: twisted one way; braided: as many each way, over and under in turn; cable: one round strand
     strands: int
     pitch: float  # length of one turn
     strand_radius: float
     phase: float  # rad
     accents: int  # the first strands have the accent colour
     binding: float  # length of the band around each end, 0 for none
+    plugs: tuple[float, float] = (0.0, 0.0)  # lengths of the connectors over the two ends, 0 for none
+    plug: tuple[float, int] = (1.0, 4)  # their radius, and the corners of their cross-section
+    frayed: float = 0.0  # how far loose yarns reach beyond the ends, 0 for none
 
 
 @dataclass
@@ -45,8 +50,10 @@ class Part:
 
 def build_rope(rng: np.random.Generator, config: RenderConfig) -> DeformedObject:
     """Add a random rope to the current scene: its 625 material points run along the centre line, end to end."""
-    shape = sample_rope(rng, ball=config.ball)
-    lay = draw_lay(rng)
+    workspace = config.scene == "workspace"
+    slenderness = (float(32 * SLENDER ** rng.random()),) * 2 if workspace else (32, 50)
+    shape = sample_rope(rng, ball=config.ball, slenderness=slenderness)
+    lay = draw_workspace_lay(rng, LENGTH / shape.thickness) if workspace else draw_lay(rng)
     points = resample(shape.centre, N_POINTS)
     info = {
         "state": shape.state,
@@ -72,6 +79,17 @@ def draw_lay(rng: np.random.Generator) -> Lay:
     return Lay("laid", strands, rng.uniform(2.4, 4.5), radius, phase, int(rng.random() < 0.35), binding)
 
 
+def draw_workspace_lay(rng: np.random.Generator, slenderness: float) -> Lay:
+    """A rope as above, or a plain cable, the longer (in diameters) the likelier; plugs at its ends, or loose yarns."""
+    if rng.random() > np.clip((slenderness - 25) / 70, 0.25, 0.9):
+        lay = draw_lay(rng)
+        return dataclasses.replace(lay, frayed=rng.uniform(0.6, 2.0)) if rng.random() < 0.25 else lay
+    ends = np.array([(0, 0), (1, 0), (0, 1), (1, 1)])[rng.choice(4, p=[0.5, 0.1, 0.1, 0.3])]
+    plugs = tuple((ends * rng.uniform(2.0, 5.0)).tolist())
+    plug = (float(rng.uniform(0.8, 1.6)), int(rng.choice([4, 12])))
+    return Lay("cable", 0, 1.0, 0.5, 0.0, 0, 0.0, plugs, plug)
+
+
 # --- geometry ---------------------------------------------------------------------------------------------------------
 
 
@@ -87,6 +105,9 @@ def build_parts(shape: RopeShape, lay: Lay) -> list[Part]:
         out = (offset[:, :1] * side + offset[:, 1:] * up) * shape.thickness
         tube = _sweep(path + out, out, lay.strand_radius * shape.thickness * cap, _flatness(lay), SIDES[lay.kind])
         parts.append(Part(tube, ACCENT if strand < lay.accents else MAIN))
+    if lay.kind == "cable":
+        parts.append(Part(_sweep(path, up, 0.5 * shape.thickness * cap, 1.0, SIDES["cable"]), MAIN))
+    parts += _plugs(path, side, up, arc, lay, shape.thickness) + _yarns(path, side, up, lay, shape.thickness)
     if lay.kind == "braided":
         parts.append(Part(_sweep(path, up, 0.30 * shape.thickness * cap, 1.0, 8), MAIN))
     parts += _bindings(path, up, arc, lay.binding, shape.thickness)
@@ -158,6 +179,37 @@ def _bindings(path: np.ndarray, up: np.ndarray, arc: np.ndarray, length: float, 
     return parts
 
 
+def _plugs(
+    path: np.ndarray, side: np.ndarray, up: np.ndarray, arc: np.ndarray, lay: Lay, thickness: float
+) -> list[Part]:
+    """A connector over each end that has one, from the tip inwards; its lower half may sink into the table."""
+    parts = []
+    for to_end, length in zip((arc, arc[-1] - arc), lay.plugs, strict=True):
+        covered = np.flatnonzero(to_end < length) if length else []
+        if len(covered) > 3:
+            radius = np.full(len(covered), lay.plug[0] * thickness)
+            radius[[0, -1]] = 1e-4  # closed at both ends
+            towards = up[covered] + (side[covered] if lay.plug[1] == 4 else 0)  # a box lies on a face, not on an edge
+            parts.append(Part(_sweep(path[covered], towards, radius, 1.0, lay.plug[1]), ACCENT))
+    return parts
+
+
+def _yarns(path: np.ndarray, side: np.ndarray, up: np.ndarray, lay: Lay, thickness: float) -> list[Part]:
+    """Loose yarns that fan out beyond both ends, where the rope is frayed: the ends look blurred."""
+    parts = []
+    for end, inner in ((0, 1), (-1, -2)) if lay.frayed else ():
+        out = (path[end] - path[inner]) / np.linalg.norm(path[end] - path[inner])
+        steps = np.linspace(-0.3, lay.frayed, 6)[:, None] * thickness
+        for k in range(11):
+            aside = 0.9 * np.sin(2.4 * k + lay.phase) * side[end] + 0.35 * np.cos(1.7 * k) * up[end]
+            spread = 0.3 * thickness + np.maximum(steps, 0) ** 2 / (lay.frayed * thickness)
+            yarn = path[end] + steps * out + spread * aside
+            yarn[:, 2] = np.maximum(yarn[:, 2], 0.07 * thickness)
+            towards = np.broadcast_to(up[end], yarn.shape)
+            parts.append(Part(_sweep(yarn, towards, np.full(6, 0.07 * thickness), 1.0, 4), MAIN))
+    return parts
+
+
 def _sphere(centre: np.ndarray, radius: float) -> np.ndarray:
     """A sphere (24, 32, 3) around centre (3,) as rings from the bottom to the top."""
     height = np.sin(np.linspace(-np.pi / 2 + 1e-3, np.pi / 2 - 1e-3, 24))
@@ -171,14 +223,18 @@ def _sphere(centre: np.ndarray, radius: float) -> np.ndarray:
 
 def _add_parts(parts: list[Part]) -> bpy.types.Object:
     """One smooth object of all parts, a material slot for each kind of face that occurs."""
-    faces, kinds, start = [], [], 0
+    faces, kinds, places, start = [], [], [], 0
     for part in parts:
         rings, sides = part.vertices.shape[:2]
         faces.append(start + grid_faces(rings, sides))
         kinds.append(np.full(len(faces[-1]), part.kind))
+        along, around = np.mgrid[0 : 1 : rings * 1j, 0 : 1 : (sides + 1) * 1j][:, :, :-1]
+        places.append(np.stack([along, around, 0 * along], axis=-1).reshape(-1, 3))
         start += rings * sides
     vertices = np.concatenate([part.vertices.reshape(-1, 3) for part in parts])
     rope = add_mesh("rope", vertices, np.concatenate(faces))
+    place = rope.data.attributes.new("along", "FLOAT_VECTOR", "POINT")  # for pictures: along each part, and around it
+    place.data.foreach_set("vector", np.concatenate(places).astype(np.float32).ravel())
     used, slots = np.unique(np.concatenate([[MAIN], *kinds]), return_inverse=True)
     for kind in used:
         rope.data.materials.append(bpy.data.materials.new(f"rope {kind}"))

@@ -7,16 +7,21 @@ pinches or is not in the state asked for is drawn again.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
+from mmgsd.scene import SceneError
 from mmgsd.scene.rope_relax import EXCLUDE, MIN_RADIUS, STEP, relax
 
 LENGTH = 1.6  # m, of every rope
+USUAL = 50  # diameters that a rope is long; longer ones bend in wider turns
 STATES = {"straight": 0.10, "bent": 0.20, "heavily bent": 0.20, "loops": 0.25, "overhand knot": 0.25}  # probabilities
+PLANS = 50_000  # curves drawn for one rope at most; one with loops takes some 200 on average
+SETTLED = 1000  # of them, suitable ones that are settled on the table at most; one or two will do
 
 
 @dataclass(frozen=True)
@@ -43,25 +48,29 @@ class OwnPart:
         return np.abs(self._tree.query(hits)[1] - indices) <= self._steps
 
 
-def sample_rope(rng: np.random.Generator, *, ball: bool = False, state: str | None = None) -> RopeShape:
+def sample_rope(
+    rng: np.random.Generator, *, ball: bool = False, state: str | None = None,
+    slenderness: tuple[float, float] = (32, 50),
+) -> RopeShape:  # fmt: skip
     """Draw a rope that rests on the table without cutting through itself.
 
     Args: rng: the only source of randomness; ball: leave room for a ball at the first end; state: one of STATES,
-    drawn if None.  Raises ValueError for an unknown state.
+    drawn if None; slenderness: range of its length in diameters.  Raises ValueError for an unknown state, SceneError
+    where no rope of the state comes about.
     """
     if state is not None and state not in STATES:
         raise ValueError(f"state must be one of {', '.join(map(repr, STATES))}, got {state!r}")
     state = state or str(rng.choice(list(STATES), p=list(STATES.values())))
     ball_radius = rng.uniform(1.25, 1.75) * ball  # in diameters
     count = {"loops": int(rng.choice([1, 2, 3], p=[0.4, 0.35, 0.25])), "overhand knot": 3}.get(state, 0)
-    while True:
-        plan = _sample_plan(rng, state, count)
-        if plan is None:
-            continue
-        points = relax(plan[0], plan[1], ball_radius)
-        shape = _finish(points, state, ball_radius)
-        if len(shape.crossings) == len(plan[2]) and is_possible(shape):
+    # lazily: the next is drawn once one has failed
+    plans = (_sample_plan(rng, state, count, slenderness) for _ in range(PLANS))
+    for particles, tension, crossings in itertools.islice(filter(None, plans), SETTLED):
+        shape = _finish(relax(particles, tension, ball_radius), state, ball_radius)
+        if len(shape.crossings) == len(crossings) and is_possible(shape):
             return shape
+    raise SceneError(f"no rope in the state {state!r} with {count} crossings and a ball of {ball_radius:.2f} diameters "
+                     f"came to lie: {PLANS} curves were drawn, or {SETTLED} suitable ones settled")  # fmt: skip
 
 
 def resample(points: np.ndarray, count: int) -> np.ndarray:
@@ -141,9 +150,11 @@ def _alternates(crossings: np.ndarray) -> bool:
 # --- drawing the curve ------------------------------------------------------------------------------------------------
 
 
-def _sample_plan(rng: np.random.Generator, state: str, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+def _sample_plan(
+    rng: np.random.Generator, state: str, count: int, slenderness: tuple[float, float]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """Particles (N, 3) in diameters, their tension (N,) and crossings (count, 2) (above, below); None if unsuitable."""
-    total = rng.uniform(32, 50)  # length over diameter
+    total = rng.uniform(*slenderness)  # length over diameter
     if state == "overhand knot":
         curvature, tension = _sample_knot(rng, total)
     else:
@@ -210,7 +221,7 @@ def _sample_bends(rng: np.random.Generator, state: str, total: float, crossings:
     }[state]
     curvature = _wobble(rng, count, {"straight": 0.12, "bent": 0.4}.get(state, 0.5))
     places = (np.arange(len(turns)) + rng.uniform(0.2, 0.8, len(turns))) / max(1, len(turns)) * total
-    radii = rng.uniform(2.0, 4.0 if crossings > 1 else 6.0, len(turns))
+    radii = rng.uniform(2.0, 4.0 if crossings > 1 else 6.0, len(turns)) * max(1.0, total / USUAL)
     for angle, place, radius in zip(turns * rng.choice([-1, 1], len(turns)), places, radii, strict=True):
         curvature = curvature + _turn(count, angle, place, radius)
     return curvature
@@ -220,6 +231,7 @@ def _sample_knot(rng: np.random.Generator, total: float) -> tuple[np.ndarray, np
     """Curvature (N,) of two tails around an overhand knot, and the tension (N,) that tightens the knot."""
     t = np.linspace(-2.0, 2.0, 4001)
     template = np.stack([t**3 - 3 * t, t**4 - 4 * t**2], axis=1) * rng.uniform(1.3, 2.2)  # Shastri's long trefoil
+    template *= np.sqrt(max(1.0, total / USUAL))
     arc = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(template, axis=0), axis=1))])
     heading = np.interp(np.arange(0, arc[-1], STEP), arc, np.unwrap(np.arctan2(*np.gradient(template, axis=0).T[::-1])))
     knot = np.diff(heading) / STEP

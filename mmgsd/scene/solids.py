@@ -20,7 +20,8 @@ class Solid:
 
 def make_box(size: np.ndarray | tuple[float, float, float], centre: tuple[float, float, float] = (0, 0, 0)) -> Solid:
     """A box of the given size (3,) about a centre (3,)."""
-    corners = np.array([[x, y, z] for z in (-0.5, 0.5) for x, y in ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5))])
+    square = ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5))
+    corners = np.array([[x, y, z] for z in (-0.5, 0.5) for x, y in square])
     faces = np.array([[3, 2, 1, 0], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]])
     return Solid(corners * size + centre, faces)
 
@@ -43,9 +44,8 @@ def make_tube(path: np.ndarray, radius: np.ndarray | float, *, sides: int = 10) 
     radius = np.concatenate([[1e-5], radius, [1e-5]])
     tangent = np.gradient(path, axis=0)
     tangent[[0, -1]] = tangent[[1, -2]]
-    aside = np.array([0.0, 0.0, 1.0]) if np.abs(tangent[:, 2]).max() < 0.9 * np.linalg.norm(tangent, axis=1).max() else (
-        np.array([0.31, 0.95, 0.05])
-    )  # fmt: skip
+    steep = np.abs(tangent[:, 2]).max() > 0.9 * np.linalg.norm(tangent, axis=1).max()
+    aside = np.array([0.31, 0.95, 0.05] if steep else [0.0, 0.0, 1.0])
     first = np.cross(aside, tangent)
     first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-12)
     second = np.cross(tangent, first)
@@ -62,7 +62,8 @@ def make_capsule(start: np.ndarray, end: np.ndarray, radius: float, tip: float |
     angles = np.linspace(0, np.pi / 2, 5)
     head = start - np.outer(radius * np.cos(angles), axis)
     tail = end + np.outer(tip * np.sin(angles), axis)
-    return make_tube(np.concatenate([head, tail]), np.concatenate([radius * np.sin(angles), tip * np.cos(angles)]) + 1e-5)
+    radii = np.concatenate([radius * np.sin(angles), tip * np.cos(angles)]) + 1e-5
+    return make_tube(np.concatenate([head, tail]), radii)
 
 
 def make_walls(outline: np.ndarray, bottom: float, top: float) -> Solid:

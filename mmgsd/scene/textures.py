@@ -13,10 +13,12 @@ import bpy
 import numpy as np
 from PIL import Image, ImageDraw
 
+from mmgsd.scene import SceneError
 from mmgsd.scene.render import MASK_PASS
 
 Colour = tuple[float, float, float, float]  # linear RGBA
 CLUTTER_PX = 512
+COLOURS = 1000  # drawn at most for one that is unlike another
 
 
 # Colour. ------------------------------------------------------------------------------------------------------------
@@ -30,11 +32,15 @@ def draw_colour(rng: np.random.Generator) -> Colour:
 
 
 def draw_contrasting(rng: np.random.Generator, other: Colour, *, distance: float = 0.25, exempt: float = 0.1) -> Colour:
-    """A colour at least ``distance`` (of display range) from ``other``, but for a share ``exempt`` of the draws."""
-    colour = draw_colour(rng)
-    while rng.random() > exempt and np.linalg.norm(_display(colour) - _display(other)) < distance:
+    """A colour at least ``distance`` (of display range) from ``other``, but for a share ``exempt`` of the draws.
+
+    SceneError where there is none so far away.
+    """
+    for _ in range(COLOURS):
         colour = draw_colour(rng)
-    return colour
+        if rng.random() <= exempt or np.linalg.norm(_display(colour) - _display(other)) >= distance:
+            return colour
+    raise SceneError(f"none of {COLOURS} colours was {distance:g} of the display's range away from {other}")
 
 
 def _display(colour: Colour) -> np.ndarray:
@@ -55,7 +61,7 @@ class Shader:
 
     def __init__(self, material: bpy.types.Material) -> None:
         material.use_nodes = True
-        self.tree = material.node_tree
+        self.material, self.tree = material, material.node_tree
         self.tree.nodes.clear()
 
     def node(self, kind: str, inputs: dict | None = None, **properties: object) -> bpy.types.Node:

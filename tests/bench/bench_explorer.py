@@ -14,7 +14,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from browser import click_figure, open_explorer, run_lab
 
 WATCH = """() => {
-    const canvas = document.querySelectorAll('.mmgsd-explorer canvas')[1];
+    const canvas = document.querySelectorAll('.mmgsd-picture canvas')[1];
     const read = () => canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data;
     const differs = (a, b) => { for (let i = 0; i < a.length; i += 41) if (a[i] !== b[i]) return true; return false; };
     window.took = new Promise(resolve => document.addEventListener('pointerdown', () => {
@@ -29,7 +29,7 @@ def main() -> None:
     """Print the median milliseconds, and the slowest tenth's."""
     clicks, rng, took = int(sys.argv[1]) if len(sys.argv) > 1 else 30, np.random.default_rng(0), []
     with tempfile.TemporaryDirectory() as folder, run_lab(Path(folder)) as address, open_explorer(address) as page:
-        for x, y in rng.uniform((0.12, 0.3), (0.38, 0.7), (clicks + 3, 2)):
+        for x, y in rng.uniform((0.24, 0.3), (0.76, 0.7), (clicks + 3, 2)):
             page.wait_for_timeout(300)
             page.evaluate(WATCH)
             click_figure(page, float(x), float(y))

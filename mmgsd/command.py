@@ -1,0 +1,41 @@
+"""How every command line ends: with one sentence instead of a traceback."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable
+
+KEPT = "what was finished is kept, and the same command goes on from there"
+
+
+def run_command(main: Callable[[], None], *, kept: str = KEPT) -> None:
+    """Run a command line's ``main``; after an error one sentence on stderr and exit 2, after Ctrl-C ``kept`` and 130.
+
+    MMGSD_TRACEBACK=1 in the environment lets the traceback through.
+    """
+    if os.environ.get("MMGSD_TRACEBACK", "0") not in ("", "0"):
+        main()
+        return
+    try:
+        main()
+    except KeyboardInterrupt:
+        _leave(f"stopped: {kept}", 130)
+    except Exception as error:
+        _leave(f"error: {describe_error(error)}", 2)
+
+
+def describe_error(error: BaseException) -> str:
+    """One line of what went wrong; an error that is not the user's says where its traceback is to be had."""
+    if isinstance(error, OSError) and error.filename is not None and error.strerror:
+        return f"{error.filename}: {error.strerror}"
+    text = " ".join(str(error).split())
+    if text and isinstance(error, ValueError | OSError | RuntimeError):
+        return text
+    said = f"{type(error).__name__}: {text}" if text else type(error).__name__
+    return f"{said} (set MMGSD_TRACEBACK=1 to see where)"
+
+
+def _leave(sentence: str, code: int) -> None:
+    print(sentence, file=sys.stderr)
+    raise SystemExit(code)
