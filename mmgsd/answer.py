@@ -41,6 +41,10 @@ class Match:
     entropy: np.ndarray  # (S,) nats, of the density over px
     outside: np.ndarray  # (S,) heatmap mass outside the 95 % ellipses of all modes that were fitted, in [0, 1]
     cells: np.ndarray  # (S, h, w) heatmap on the descriptors' grid, sums to 1
+    # None of what made the answer does not know it: weights that learnt no mask, hand-made descriptors
+    visible: np.ndarray | None = None  # (S, n) in [0, 1], whether each mode's match is seen there, or hidden
+    on_object: np.ndarray | None = None  # (S,) in [0, 1], whether the pixel asked about shows the object
+    absent: np.ndarray | None = None  # (S,) in [0, 1], whether image1 does not show the object at all
 
     @cached_property
     def heatmap(self) -> np.ndarray:
@@ -75,15 +79,28 @@ class Match:
     def best(self, *, min_confidence: float = 0.0, radius_px: float = RADIUS_PX) -> Best:
         """The mode with the least spread of each query: which of the like places to grasp (paper introduction).
 
-        Abstains, with NaN for ``xy``, where a true match lies within ``radius_px`` with less than ``min_confidence``.
+        One that is seen is preferred to one that is hidden, where that is known. Abstains, with NaN for ``xy``, where a
+        true match lies within ``radius_px`` with less than ``min_confidence``, where the pixel asked about is more
+        likely background, and where the object is more likely not in image1.
         """
         if not 0 <= min_confidence <= 1:
             raise ValueError(f"min_confidence must be in [0, 1], got {min_confidence!r}")
         rows = np.arange(len(self.modes))
-        chosen = np.nan_to_num(self.spread_px, nan=np.inf).argmin(1)
+        spread = np.nan_to_num(self.spread_px, nan=np.inf)
+        hidden = np.zeros(spread.shape, bool) if self.visible is None else self.visible < 0.5
+        chosen = np.lexsort((spread, hidden), axis=1)[:, 0]
         confidence = self.confidence(radius_px=radius_px)[rows, chosen]
-        xy = np.where((confidence >= min_confidence)[:, None], self.modes[rows, chosen], np.nan)
+        able = (confidence >= min_confidence) & self.answerable
+        xy = np.where(able[:, None], self.modes[rows, chosen], np.nan)
         return Best(xy, self.spread_px[rows, chosen], confidence)
+
+    @property
+    def answerable(self) -> np.ndarray:
+        """(S,) bool, whether the pixel asked about and image1 both show the object, as far as that is known."""
+        able = np.ones(len(self), bool)
+        if self.on_object is not None:
+            able &= self.on_object >= 0.5
+        return able if self.absent is None else able & (self.absent <= 0.5)
 
     def __len__(self) -> int:
         return len(self.xy)

@@ -19,6 +19,7 @@ from mmgsd.config import EvaluateConfig, digest, read_count, read_flag
 from mmgsd.dataset import Dataset, load_dataset, sample_pairs
 from mmgsd.dataset_format import UNREADABLE
 from mmgsd.files import DamagedFileError, read_json, saying_what_stays, set_aside, write_json, writing
+from mmgsd.heads import Outputs
 from mmgsd.matching import Matcher, check_scales, read_heatmap
 from mmgsd.metrics import aggregate, compute_mahalanobis2, compute_query_errors
 from mmgsd.mixture import Mixture, check_modes
@@ -273,15 +274,17 @@ def _chance_answer(method: str, data: Dataset) -> Answer:
     return answer
 
 
-def _describe(matcher: Matcher, data: Dataset, indices: np.ndarray, *, batch: int = 16) -> dict[int, Tensor]:
-    """Descriptors (C, h, w) of the images, computed once each; ValueError for images of another object."""
+def _describe(matcher: Matcher, data: Dataset, indices: np.ndarray, *, batch: int = 16) -> dict[int, Outputs]:
+    """What the network says of the images, computed once each; ValueError for images of another object."""
     if matcher.object and matcher.object != data.object:
         raise ValueError(f"weights must be of the object {data.object!r} of {data.folder}, got weights of "
                          f"{matcher.object!r}")  # fmt: skip
     return dict(_describe_batches(matcher, data, indices, batch))
 
 
-def _describe_batches(matcher: Matcher, data: Dataset, indices: np.ndarray, batch: int) -> Iterator[tuple[int, Tensor]]:
+def _describe_batches(
+    matcher: Matcher, data: Dataset, indices: np.ndarray, batch: int
+) -> Iterator[tuple[int, Outputs]]:
     for start in range(0, len(indices), batch):
         chosen = indices[start : start + batch]
         yield from zip(chosen.tolist(), matcher.describe([data.load_image(i) for i in chosen]), strict=True)

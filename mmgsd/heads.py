@@ -8,8 +8,9 @@ of the material points, and images without the object.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -18,17 +19,35 @@ SURFACE = 16  # numbers that describe a place's surface to the judge: is it a fo
 HIDDEN = 64  # units of the judge
 JITTER_PX = 6.0  # std by which true matches are moved before they are judged: modes are never exact
 ELSEWHERE = 2  # further places a query that are no match, and so not seen there
+ELSEWHERE_WEIGHT = 0.02  # of a heatmap's mass off the object, where the network itself says what is off it
 SHARES = {"mask": 1.0, "judge": 0.5, "present": 0.2}  # of the losses
 
 
 @dataclass(frozen=True)
 class Outputs:
-    """What a network says of B images; only ``descriptors`` of one without heads."""
+    """What a network says of B images, or without the first axis of one; only ``descriptors`` where it has no heads."""
 
     descriptors: Tensor  # (B, C, h, w)
     mask: Tensor | None = None  # (B, hm, wm) logits: is the object seen here?
     surface: Tensor | None = None  # (B, SURFACE, h, w) for `Heads.judge`
     present: Tensor | None = None  # (B,) logits: is the object in the image?
+
+    def turn(self, quarters: int) -> Outputs:
+        """The same of images turned by so many quarters."""
+        planes = {name: getattr(self, name) for name in ("descriptors", "mask", "surface")}
+        return replace(self, **{n: None if x is None else x.rot90(quarters, (-2, -1)) for n, x in planes.items()})
+
+    def split(self) -> list[Outputs]:
+        """Of each image by itself."""
+        names = [field.name for field in fields(self) if getattr(self, field.name) is not None]
+        parts = zip(*(getattr(self, name) for name in names), strict=True)
+        return [Outputs(**dict(zip(names, part, strict=True))) for part in parts]
+
+    @staticmethod
+    def mean(several: Sequence[Outputs]) -> Outputs:
+        """The mean of what was said of the same images."""
+        names = [field.name for field in fields(Outputs) if getattr(several[0], field.name) is not None]
+        return Outputs(**{name: sum(getattr(one, name) for one in several) / len(several) for name in names})
 
 
 class Heads(nn.Module):
@@ -65,6 +84,37 @@ class Heads(nn.Module):
         apart = [asked - role for role in there.chunk(self.roles, -1)]
         near = [difference.square().sum(-1, keepdim=True).clamp(max=50) / 10 for difference in apart]
         return self.judge_layers(torch.cat([*apart, *near, surface], -1))[..., 0]
+
+
+def weigh_cells(said: Outputs, shape: tuple[int, int], mask: Tensor | None = None) -> Tensor | None:
+    """How much a match may lie in each cell (h, w) of a heatmap, in [0, 1]; None where nothing is known of the object.
+
+    1 at the object and beside it, for masks are not exact and a hidden point may lie a little aside. Elsewhere nothing
+    under a ``mask`` (H, W) bool of the caller's, and `ELSEWHERE_WEIGHT` under the network's own, which may be wrong.
+    """
+    if mask is None and said.mask is None:
+        return None
+    known = said.mask.sigmoid() if mask is None else mask.to(said.descriptors.device).float()
+    cells = F.adaptive_max_pool2d(known[None, None], tuple(shape))
+    cells = F.max_pool2d(cells, 3, 1, 1)[0, 0]
+    return cells if mask is not None else cells.clamp(min=ELSEWHERE_WEIGHT)
+
+
+def look_up(
+    mask: np.ndarray | None, logits: Tensor | None, xy: np.ndarray, size: tuple[int, int]
+) -> np.ndarray | None:
+    """How likely the object is seen at pixels ``xy`` (S, 2) of an image of ``size``, (S,) in [0, 1].
+
+    By the caller's ``mask`` (H, W) bool or else mask ``logits`` (hm, wm); None without either.
+    """
+    if mask is not None:
+        columns, rows = np.rint(xy).astype(int).T
+        return mask[rows.clip(0, size[1] - 1), columns.clip(0, size[0] - 1)].astype(np.float32)
+    if logits is None:
+        return None
+    grid = (torch.from_numpy(xy).to(logits.device).float() + 0.5) / logits.new_tensor(size) * 2 - 1
+    found = F.grid_sample(logits[None, None], grid[None, None], padding_mode="border", align_corners=False)
+    return found[0, 0, 0].sigmoid().cpu().numpy()
 
 
 def compute_mask_loss(logits: Tensor, mask: Tensor) -> Tensor:

@@ -107,6 +107,18 @@ def check_pixels(xy: Any, size: tuple[int, int], *, image: str = "image0") -> np
     return points.astype(np.float32)
 
 
+def check_mask(mask: Any, shape: tuple[int, int], name: str) -> np.ndarray:
+    """A copy of a mask (H, W) bool of an image of that ``shape``; ValueError for another, or where it is all False."""
+    values = _to_array(mask, name)
+    if values.dtype != bool:
+        raise ValueError(f"{name} must be bool, True on the object, got {values.dtype}: compare it, as in mask > 127")
+    if values.shape != tuple(shape):
+        raise ValueError(f"{name} must have its image's shape {tuple(shape)}, got {values.shape}")
+    if not values.any():
+        raise ValueError(f"{name} must be True somewhere, got a mask without any object")
+    return np.array(values)
+
+
 def check_aspect(size: tuple[int, int], name: str) -> None:
     """ValueError for an image of ``size`` (width, height) that is too narrow a strip."""
     if max(size) > MAX_ASPECT * min(size):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +16,8 @@ from torch import Tensor
 from mmgsd.answer import Best as Best
 from mmgsd.answer import Match
 from mmgsd.config import CONTRASTIVE, ROUNDNESS, TrainConfig, find_root
-from mmgsd.images import check_aspect, check_pixels, to_rgb
+from mmgsd.heads import Outputs, look_up, weigh_cells
+from mmgsd.images import check_aspect, check_mask, check_pixels, to_rgb
 from mmgsd.images import read_image as read_image
 from mmgsd.losses import compute_squared_distances
 from mmgsd.mixture import Mixture, check_count, check_modes, fit_modes, keep_most_probable
@@ -85,11 +87,12 @@ class Matcher:
         return matcher
 
     @torch.inference_mode()
-    def describe(self, images: list[np.ndarray]) -> list[Tensor]:
-        """Descriptors (C, h, w) of each of the images (H, W, 3) uint8 of any sizes, the mean over quarter turns.
+    def describe(self, images: list[np.ndarray]) -> list[Outputs]:
+        """What the network says of each of the images (H, W, 3) uint8 of any sizes, the mean over quarter turns.
 
-        C is D, or 2 D where an image is described in both roles: as a source first, then as a target. The grid follows
-        the image's own aspect (`fit_input_size`); images of one grid are described at once.
+        An `Outputs` each, without the batch's axis: ``descriptors`` (C, h, w), where C is D, or 2 D where an image is
+        described in both roles (as a source first, then as a target), and what the heads say where there are any. The
+        grid follows the image's own aspect (`fit_input_size`); images of one grid are described at once.
         """
         sizes = [self.compute_input_size(image) for image in images]
         described = {}
@@ -97,7 +100,7 @@ class Matcher:
             chosen = [index for index, other in enumerate(sizes) if other == size]
             small = [cv2.resize(images[index], size, interpolation=cv2.INTER_AREA) for index in chosen]
             batch = torch.from_numpy(np.stack(small)).to(self.device).permute(0, 3, 1, 2).float() / 255
-            described |= zip(chosen, self.describe_inputs(batch), strict=True)
+            described |= zip(chosen, self._say(batch).split(), strict=True)
         return [described[index] for index in range(len(images))]
 
     def compute_input_size(self, image: np.ndarray, name: str = "image") -> tuple[int, int]:
@@ -111,60 +114,127 @@ class Matcher:
 
     def describe_inputs(self, batch: Tensor) -> Tensor:
         """Descriptors (B, C, h, w) of images (B, 3, H, W) in [0, 1] of the network's input size."""
-        return sum(self._describe_turned(batch, k) for k in range(self.turns)) / self.turns
+        return self._say(batch).descriptors
 
-    def _describe_turned(self, batch: Tensor, quarters: int) -> Tensor:
-        """Descriptors of images seen after so many quarter turns, turned back."""
-        turned = batch.rot90(quarters, (2, 3)).contiguous(memory_format=torch.channels_last)
-        return self.network(turned).rot90(-quarters, (2, 3))
+    def _say(self, batch: Tensor) -> Outputs:
+        """The mean of what the network says of images after each quarter turn, turned back."""
+        turns = (batch.rot90(k, (2, 3)).contiguous(memory_format=torch.channels_last) for k in range(self.turns))
+        said = [self.network.describe(turned).turn(-k) for k, turned in enumerate(turns)]
+        return Outputs.mean(said)
 
     @torch.inference_mode()
-    def compute_heatmaps(self, descriptors0: Tensor, descriptors1: Tensor, xy: Tensor, size: tuple[int, int]) -> Tensor:
-        """Heatmaps (S, h, w) of source px ``xy`` (S, 2) of an image of ``size``, from what `describe` made of each."""
-        dim = self.config.descriptor_dim
-        source = sample_descriptors(descriptors0[None, :dim], xy[None].to(self.device), size)  # (1, S, D)
-        squared = compute_squared_distances(source, descriptors1[-dim:].flatten(1).T[None])[0]  # (S, h * w)
+    def compute_heatmaps(
+        self, said0: Outputs, said1: Outputs, xy: Tensor, size: tuple[int, int], *, mask1: Tensor | None = None
+    ) -> Tensor:
+        """Heatmaps (S, h, w) of source px ``xy`` (S, 2) of an image of ``size``, from what `describe` made of each.
+
+        They are weighted by where the second image shows the object: by ``mask1`` (H1, W1) bool, or else by the
+        network's own mask, if it has one.
+        """
+        source = self._sample_sources(said0, xy, size)  # (1, S, D)
+        target = said1.descriptors[-self.config.descriptor_dim :]
+        squared = compute_squared_distances(source, target.flatten(1).T[None])[0]  # (S, h * w)
         heatmap = compute_heatmap(squared, bandwidth=self.bandwidth, temperature=self.temperature)
-        return heatmap.view(len(xy), *descriptors1.shape[1:])
+        heatmap = heatmap.view(len(xy), *target.shape[1:])
+        weight = weigh_cells(said1, target.shape[1:], mask1)
+        if weight is None:
+            return heatmap
+        weighted = heatmap * weight
+        total = weighted.sum((1, 2), keepdim=True)
+        return torch.where(total > 1e-12, weighted / total.clamp(min=1e-12), heatmap)
 
     @torch.inference_mode()
-    def match(self, image0: np.ndarray, image1: np.ndarray, xy: Any, *, n: Any = None) -> Match:
+    def compute_visible(
+        self, said0: Outputs, said1: Outputs, xy: Tensor, modes: Tensor, sizes: tuple[tuple[int, int], ...]
+    ) -> Tensor | None:
+        """Probability (S, n) that what lies at ``xy`` (S, 2) px is seen at each of the ``modes`` (S, n, 2) px.
+
+        ``sizes`` are the two images' (width, height). 0 for modes that are NaN; None of a network without heads.
+        """
+        if said1.surface is None:
+            return None
+        there = torch.cat([said1.descriptors, said1.surface])[None]
+        places = modes.to(self.device).float().nan_to_num(-0.5)
+        there = sample_descriptors(there, places.flatten(0, 1)[None], sizes[1])[0].view(*modes.shape[:2], -1)
+        channels = len(said1.descriptors)
+        asked = self._sample_sources(said0, xy, sizes[0])[0][:, None]  # (S, 1, D)
+        logits = self.network.heads.judge(asked, there[..., :channels], there[..., channels:])
+        return torch.sigmoid(logits) * modes.isfinite().all(-1).to(logits.device)
+
+    def segment(self, image: Any) -> np.ndarray:
+        """Where an image shows the object: (H, W) float32 in [0, 1]; ValueError of weights that learnt no mask."""
+        image = to_rgb(image)
+        self.compute_input_size(image)
+        mask = self.describe([image])[0].mask
+        if mask is None:
+            raise ValueError(f"these weights of {self.config.name} learnt no mask: load others, like 'cloth' or 'rope'")
+        return cv2.resize(mask.sigmoid().cpu().numpy(), image.shape[1::-1], interpolation=cv2.INTER_LINEAR)
+
+    def _sample_sources(self, said0: Outputs, xy: Tensor, size: tuple[int, int]) -> Tensor:
+        sources = said0.descriptors[None, : self.config.descriptor_dim]
+        return sample_descriptors(sources, xy[None].to(self.device).float(), size)
+
+    def match(
+        self, image0: Any, image1: Any, xy: Any, *, n: Any = None, mask0: Any = None, mask1: Any = None
+    ) -> Match:
         """All matches in ``image1`` of the pixels ``xy`` (S, 2), or of the one pixel (2,), of ``image0``.
 
         Images are of any size and each of its own, and of any kind that `mmgsd.images.to_rgb` takes; they are copied.
         ``n`` modes are returned, one number for all or (S,), by default as many as the symmetry group has members;
         "auto" finds their number. The group's number is fitted even where fewer are asked for: of these the most
-        probable are the answer, and their weights are divided by their sum. ValueError for other images, for ``xy``
-        outside image0, or for ``n`` that is not from 1 to `MAX_MODES`.
+        probable are the answer, and their weights are divided by their sum. ``mask0`` and ``mask1``, (H, W) bool each,
+        say where the images show the object, from any segmenter of yours: the network's own masks then do not count.
+        ValueError for other images or masks, for ``xy`` outside image0, or for ``n`` that is not from 1 to `MAX_MODES`.
         """
-        return self.prepare(image0, image1).match(xy, n=n)
+        return self.prepare(image0, image1, mask0=mask0, mask1=mask1).match(xy, n=n)
 
-    def prepare(self, image0: np.ndarray, image1: np.ndarray) -> Pair:
-        """Describe two images once, to ask about them many times; ValueError for other images than `match` takes."""
+    def prepare(self, image0: Any, image1: Any, *, mask0: Any = None, mask1: Any = None) -> Pair:
+        """Describe two images once, to ask about them many times; arguments and errors are those of `match`."""
         images = {name: to_rgb(image, name) for name, image in (("image0", image0), ("image1", image1))}
         for name, image in images.items():
             self.compute_input_size(image, name)
-        return Pair(self, *images.values(), tuple(self.describe(list(images.values()))))
+        masks = {"mask0": mask0, "mask1": mask1}
+        for (name, mask), image in zip(masks.items(), images.values(), strict=True):
+            masks[name] = None if mask is None else check_mask(mask, image.shape[:2], name)
+        return Pair(self, *images.values(), tuple(self.describe(list(images.values()))), **masks)
 
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Two images with their descriptors: each question takes a few milliseconds."""
+    """Two images and what the network says of them: each question takes a few milliseconds."""
 
     matcher: Matcher
     image0: np.ndarray  # (H0, W0, 3) uint8
     image1: np.ndarray  # (H1, W1, 3) uint8
-    descriptors: tuple[Tensor, Tensor]  # (C, h0, w0), (C, h1, w1)
+    said: tuple[Outputs, Outputs]
+    mask0: np.ndarray | None = None  # (H0, W0) bool, of the caller's
+    mask1: np.ndarray | None = None  # (H1, W1) bool
 
     @torch.inference_mode()
     def match(self, xy: Any, *, n: Any = None) -> Match:
         """As `Matcher.match`."""
-        size0, size1 = ((im.shape[1], im.shape[0]) for im in (self.image0, self.image1))
+        size0, size1 = sizes = tuple((im.shape[1], im.shape[0]) for im in (self.image0, self.image1))
         points = check_pixels(xy, size0)
-        cells = self.matcher.compute_heatmaps(*self.descriptors, torch.from_numpy(points), size0)
+        mask1 = None if self.mask1 is None else torch.from_numpy(self.mask1)
+        cells = self.matcher.compute_heatmaps(*self.said, torch.from_numpy(points), size0, mask1=mask1)
         centres = compute_cell_centres(size1, cells.shape[-2:])
         fitted, roundness = self.matcher.modes, self.matcher.config.roundness
-        return make_match(self.image0, self.image1, points, cells, centres, n, fitted=fitted, roundness=roundness)
+        match = make_match(self.image0, self.image1, points, cells, centres, n, fitted=fitted, roundness=roundness)
+        return dataclasses.replace(match, **self._look(match, sizes))
+
+    def _look(self, match: Match, sizes: tuple[tuple[int, int], ...]) -> dict[str, np.ndarray]:
+        """What is known of the object's presence: ``visible``, ``on_object`` and ``absent`` of a match."""
+        known, xy = {}, torch.from_numpy(match.xy)
+        visible = self.matcher.compute_visible(*self.said, xy, torch.from_numpy(match.modes), sizes)
+        if visible is not None:
+            known["visible"] = visible.cpu().numpy()
+        on_object = look_up(self.mask0, self.said[0].mask, match.xy, sizes[0])
+        if on_object is not None:
+            known["on_object"] = on_object
+        if self.mask1 is not None or self.said[1].present is not None:
+            absent = 0.0 if self.mask1 is not None else float(1 - self.said[1].present.sigmoid())
+            known["absent"] = np.full(len(match), absent, np.float32)
+        return known
 
 
 def load(weights: Path | str, *, device: str = "") -> Matcher:

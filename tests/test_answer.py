@@ -121,3 +121,16 @@ def test_an_answer_is_described_in_a_line(five: Match) -> None:
 def test_an_answer_can_be_kept(five: Match) -> None:
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(five)).modes, five.modes)
     assert five == five and five != five[:]
+
+
+def test_the_best_mode_is_one_that_is_seen(rng: np.random.Generator) -> None:
+    image, modes = np.zeros((20, 20, 3), np.uint8), np.arange(6.0).reshape(1, 3, 2)
+    covariances = np.eye(2) * np.array([1.0, 4.0, 9.0])[:, None, None]
+    match = Match(image, image, np.zeros((1, 2)), modes, np.full((1, 3), 1 / 3), covariances[None], np.zeros(1),
+                  np.zeros(1), np.ones((1, 2, 2)) / 4)  # fmt: skip
+    seen = dataclasses.replace(match, visible=np.array([[0.1, 0.9, 0.8]]))
+    assert match.best().xy.tolist() == [[0, 1]] and seen.best().xy.tolist() == [[2, 3]]
+    hidden = dataclasses.replace(match, visible=np.array([[0.1, 0.2, 0.3]]))
+    assert hidden.best().xy.tolist() == [[0, 1]]
+    for unable in ({"on_object": np.array([0.2])}, {"absent": np.array([0.9])}):
+        assert np.isnan(dataclasses.replace(seen, **unable).best().xy).all()

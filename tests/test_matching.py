@@ -14,6 +14,7 @@ from mmgsd import matching
 from mmgsd.baselines import BaselineMatcher
 from mmgsd.config import NETWORKS, TrainConfig
 from mmgsd.dataset import load_dataset
+from mmgsd.heads import Outputs
 from mmgsd.matching import Matcher, compute_entropy, compute_heatmap, load, make_match
 from mmgsd.metrics import compute_query_errors
 from mmgsd.mixture import Mixture
@@ -89,7 +90,8 @@ def test_the_first_image_asks_and_the_second_answers() -> None:
     asking, answering = torch.zeros(2, 4, 8, 8)
     asking[:2] = 3.0
     answering[2:, 5, 6] = 3.0  # the one cell that is a good target
-    heatmap = matcher.compute_heatmaps(asking, answering, torch.tensor([[30.0, 30.0]]), (64, 64))[0]
+    said = Outputs(asking), Outputs(answering)
+    heatmap = matcher.compute_heatmaps(*said, torch.tensor([[30.0, 30.0]]), (64, 64))[0]
     assert divmod(int(heatmap.argmax()), 8) == (5, 6) and heatmap.max() > 0.99
 
 
@@ -225,14 +227,18 @@ def test_another_number_of_modes(matcher: Matcher, image: np.ndarray, bad: objec
 
 def test_images_keep_their_aspect(matcher: Matcher) -> None:
     shapes = [(485, 485), (364, 485), (485, 364), (970, 970), (400, 100)]
-    grids = [tuple(d.shape[1:]) for d in matcher.describe([np.zeros((*shape, 3), np.uint8) for shape in shapes])]
+    grids = [
+        tuple(said.descriptors.shape[1:])
+        for said in matcher.describe([np.zeros((*shape, 3), np.uint8) for shape in shapes])
+    ]
     assert grids == [(16, 16), (14, 18), (18, 14), (16, 16), (48, 12)]
 
 
 def test_images_of_several_aspects_are_described_as_each_alone(matcher: Matcher, rng: np.random.Generator) -> None:
     images = [rng.integers(0, 256, (*shape, 3), dtype=np.uint8) for shape in ((90, 130), (200, 150), (180, 260))]
     for together, image in zip(matcher.describe(images), images, strict=True):
-        torch.testing.assert_close(together, matcher.describe([image])[0], atol=0.02, rtol=0.05)
+        alone = matcher.describe([image])[0].descriptors
+        torch.testing.assert_close(together.descriptors, alone, atol=0.02, rtol=0.05)
 
 
 @pytest.mark.parametrize("name", ["image0", "image1"])
@@ -302,3 +308,58 @@ def test_damaged_descriptors_give_no_answer(matcher: Matcher, image: np.ndarray)
     cells = torch.full((1, 8, 8), torch.nan)
     with pytest.raises(ValueError, match="heatmap must be finite, got NaN or infinity"):
         make_match(image, image, np.zeros((1, 2)), cells, compute_cell_centres((160, 120), (8, 8)), 4)
+
+
+@pytest.fixture(scope="module")
+def seeing() -> Matcher:
+    """A matcher whose network has heads, and has learnt nothing."""
+    torch.manual_seed(0)
+    config = dataclasses.replace(CONFIG, roles=2, heads=True)
+    network = build_network("lite0", config.descriptor_dim, roles=2, heads=True, pretrained=False)
+    return Matcher(network, config, modes=4, size=(485, 485), device="cpu")
+
+
+def test_heads_say_what_is_seen_what_is_asked_and_what_is_there(seeing: Matcher, image: np.ndarray) -> None:
+    match = seeing.match(image, image, xy=[(5, 5), (60, 80)])
+    assert match.visible.shape == (2, 4) and match.on_object.shape == match.absent.shape == (2,)
+    for values in (match.visible, match.on_object, match.absent):
+        assert ((values >= 0) & (values <= 1)).all()
+    assert match[1].visible.shape == (1, 4)
+    mask = seeing.segment(image)
+    assert mask.shape == image.shape[:2] and mask.dtype == np.float32 and 0 <= mask.min() <= mask.max() <= 1
+
+
+def test_without_heads_nothing_is_said_of_presence(matcher: Matcher, image: np.ndarray) -> None:
+    match = matcher.match(image, image, xy=(5, 5))
+    assert match.visible is None and match.on_object is None and match.absent is None
+    assert match.answerable.all()
+    with pytest.raises(ValueError, match="learnt no mask"):
+        matcher.segment(image)
+
+
+@pytest.mark.parametrize("name", ["matcher", "seeing"])
+def test_a_mask_of_the_callers_decides(name: str, image: np.ndarray, request: pytest.FixtureRequest) -> None:
+    left = np.zeros(image.shape[:2], bool)
+    left[:, :40] = True
+    match = request.getfixturevalue(name).match(image, image, xy=[(5, 5), (150, 5)], mask0=left, mask1=left)
+    assert match.heatmap[:, :, 80:].sum(axis=(1, 2)).max() < 1e-6
+    assert match.on_object.tolist() == [1, 0] and match.absent.tolist() == [0, 0]
+    assert np.isfinite(match.best().xy[0]).all() and np.isnan(match.best().xy[1]).all()
+
+
+@pytest.mark.parametrize("name", ["mask0", "mask1"])
+@pytest.mark.parametrize(
+    ("mask", "message"),
+    [
+        (np.ones((120, 159), bool), "must have its image's shape .120, 160., got .120, 159."),
+        (np.zeros((120, 160), bool), "must be True somewhere"),
+        (np.ones((120, 160), np.uint8), "must be bool, True on the object, got uint8"),
+        (np.ones((120, 160, 1), bool), "must have its image's shape"),
+        ("mask.png", "must be bool"),
+    ],
+)
+def test_a_mask_that_cannot_be_is_refused_by_name(
+    matcher: Matcher, image: np.ndarray, name: str, mask: object, message: str
+) -> None:
+    with pytest.raises(ValueError, match=f"{name} {message}"):
+        matcher.match(image, image, xy=(5, 5), **{name: mask})
