@@ -230,7 +230,7 @@ def test_files_chosen_on_the_page_become_the_pair(explorer: Explorer, rng: np.ra
 def test_a_file_that_is_no_image_is_said_and_nothing_changes(explorer: Explorer) -> None:
     before = explorer.pictures.pair
     heard = tell(explorer, "file", side=1, name="IMG_1.HEIC", part=0, parts=1, buffers=(b"\0\0\0\x18ftypheic",))
-    assert heard.startswith("IMG_1.HEIC is a HEIC image") and "JPEG, PNG" in heard
+    assert heard.startswith("IMG_1.HEIC is a HEIC image") and "PNG, JPEG" in heard
     assert explorer.pictures.pair == before
 
 
@@ -240,7 +240,7 @@ def test_images_are_decoded_upright_and_damaged_ones_named(rng: np.random.Genera
     exif[0x0112] = 6  # to be turned by a quarter
     np.testing.assert_array_equal(decode_image(encode(image, exif=exif), "a.png"), np.rot90(image, -1))
     for data in (b"", b"no image", encode(image)[:200]):
-        with pytest.raises(ValueError, match="holiday.jpg is no image, or damaged"):
+        with pytest.raises(ValueError, match="holiday.jpg is (no image that can be read|a damaged image)"):
             decode_image(data, "holiday.jpg")
 
 

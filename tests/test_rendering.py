@@ -155,9 +155,10 @@ def test_a_workspace_is_another_data_set_and_a_plain_one_is_described_as_ever(tm
         "object": "rope", "train_images": 3, "test_images": 2, "views": 1, "samples": 1, "rotation_deg": 180.0,
         "ball": False, "seed": 5, "scenes": 1,
     }  # fmt: skip
-    rendering._claim(CONFIG, tmp_path)
+    (tmp_path / "config.json").write_text(json.dumps(rendering._describe(CONFIG)))
+    assert rendering._is_claimed(CONFIG, tmp_path)
     with pytest.raises(ValueError, match="scene: 'plain' there, 'workspace' asked for"):
-        rendering._claim(dataclasses.replace(CONFIG, scene="workspace"), tmp_path)
+        rendering._is_claimed(dataclasses.replace(CONFIG, scene="workspace"), tmp_path)
 
 
 def test_an_object_without_a_file_is_named(tmp_path: Path) -> None:

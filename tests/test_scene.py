@@ -208,3 +208,10 @@ def test_views_of_a_tshirt_are_labelled():
     assert view.xy.shape == (len(sheet.rest), 2)
     x, y = np.rint(view.xy[view.visible]).astype(int).T
     assert np.mean(distance_transform_edt(~view.mask)[y, x] <= 1.5) > 0.98
+
+
+def test_every_view_has_a_picture_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cycles takes a picture at the address of a removed one for that one, and shows what lay there before."""
+    monkeypatch.setattr(randomize, "BACKGROUNDS", {"clutter": textures.BACKGROUNDS["clutter"]})
+    episode.render_episode(RenderConfig(object="rope"), "train", 0, 3)
+    assert len([image for image in bpy.data.images if image.name.startswith("clutter")]) == 3

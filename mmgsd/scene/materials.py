@@ -14,8 +14,11 @@ PROCEDURAL = {"wood": 0.4, "noise": 0.25, "tiles": 0.15, "checker": 0.08, "terra
 
 
 def remove_view() -> None:
-    """Forget the things, materials and pictures of the last view."""
-    kinds = (bpy.data.objects, bpy.data.meshes, bpy.data.materials, bpy.data.images)
+    """Forget the things and materials of the last view.
+
+    Its pictures stay until the episode's end: Cycles takes a new one at a removed one's address for the old.
+    """
+    kinds = (bpy.data.objects, bpy.data.meshes, bpy.data.materials)
     bpy.data.batch_remove([block for kind in kinds for block in kind if block.name.startswith(PREFIX)])
 
 

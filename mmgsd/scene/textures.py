@@ -202,8 +202,7 @@ def _ground_clutter(rng: np.random.Generator, shader: Shader, colour: Colour, pl
     """A picture of random shapes, about two metres wide."""
     pixels = np.ones((CLUTTER_PX, CLUTTER_PX, 4), dtype=np.float32)
     pixels[..., :3] = np.asarray(draw_clutter(rng, colour), dtype=np.float32) / 255
-    if "clutter" in bpy.data.images:
-        bpy.data.images.remove(bpy.data.images["clutter"])
+    # none of an earlier view is removed: Cycles would take a new one at its address for it
     image = bpy.data.images.new("clutter", CLUTTER_PX, CLUTTER_PX)
     image.pixels.foreach_set(pixels.ravel())
     vector = shader.node("Mapping", {"Vector": place, "Scale": [rng.uniform(0.3, 0.8)] * 3}).outputs[0]
