@@ -134,8 +134,10 @@ def test_every_thing_stands_on_the_table_and_is_closed_to_rays(name: str, rng: n
             assert solid.vertices[:, 2].min() > -0.05
 
 
-def test_nothing_of_a_view_stays() -> None:
+def test_nothing_of_a_view_stays_but_its_pictures_until_the_episode_ends() -> None:
     render_views("rope", 2)
     materials.remove_view()
-    kinds = (bpy.data.objects, bpy.data.meshes, bpy.data.materials, bpy.data.images)
+    kinds = (bpy.data.objects, bpy.data.meshes, bpy.data.materials)
     assert not [block.name for kind in kinds for block in kind if block.name.startswith(materials.PREFIX)]
+    render.reset_scene()
+    assert not len(bpy.data.images)
