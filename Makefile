@@ -63,27 +63,27 @@ figures: $(STAMP) ## Draw the paper's figures of PRESET (paper) again from data/
 	$(PAPERMILL) notebooks/07_figures.ipynb data/generated/figures_$(PRESET).ipynb -p preset $(PRESET)
 
 readme: $(STAMP) ## Put the numbers of data/results into the tables of README.md and data/results/README.md
-	$(PY) -m mmgsd.tables data/results README.md data/results/README.md
+	$(PY) -m mmgsd.report.tables data/results README.md data/results/README.md
 
 data-pack: $(STAMP) ## Pack the data sets of PRESET (paper) into data/packs, to travel to another machine
-	$(PY) -m mmgsd.packing pack $(PRESET)
+	$(PY) -m mmgsd.extras.packing pack $(PRESET)
 
 # No archive is in git or on the web: each comes from a machine that rendered, where make data-pack made it.
 data-unpack: $(STAMP) ## Unpack them there, once data/packs has both archives of PRESET and their notes, copied by you
-	$(PY) -m mmgsd.packing unpack $(PRESET)
+	$(PY) -m mmgsd.extras.packing unpack $(PRESET)
 
 data-sample: $(STAMP) ## Copy 24 images of each object of PRESET into data/sample
-	$(PY) -m mmgsd.packing sample $(PRESET)
+	$(PY) -m mmgsd.extras.packing sample $(PRESET)
 
 weights: $(STAMP) ## Put the models of PRESET into data/weights, in half precision and with a card each
-	$(PY) -m mmgsd.shipping $(PRESET)
+	$(PY) -m mmgsd.extras.shipping $(PRESET)
 
 # Not committed: numbers, tables and verdicts are made anew from data/results/PRESET.
 paper: $(STAMP) ## Make the replication report paper/report.pdf from the results of PRESET; needs LaTeX
 	@command -v latexmk > /dev/null || { \
 		echo "make paper needs latexmk and LaTeX: on Debian, apt-get install latexmk texlive-latex-base texlive-latex-extra" \
 			"texlive-publishers texlive-science texlive-fonts-recommended." >&2; exit 1; }
-	$(PY) -m mmgsd.report $(PRESET)
+	$(PY) -m mmgsd.report.latex $(PRESET)
 	cd paper && latexmk -pdf -interaction=nonstopmode -halt-on-error report.tex
 
 lab: $(STAMP) ## Open the notebooks in JupyterLab

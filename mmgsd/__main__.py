@@ -78,7 +78,7 @@ def _check_out(asked: argparse.Namespace) -> None:
     """ValueError for a picture that would replace an image, or hold more queries than a page does."""
     if not asked.out:
         return
-    from mmgsd.plots import PAGE_QUERIES
+    from mmgsd.figures.plots import PAGE_QUERIES
 
     if asked.out.resolve() in (asked.image0.resolve(), asked.image1.resolve()):
         raise ValueError(f"--out must not be one of the images, got {asked.out}")
@@ -87,7 +87,7 @@ def _check_out(asked: argparse.Namespace) -> None:
 
 
 def _export(asked: argparse.Namespace) -> None:
-    from mmgsd.exporting import export_onnx
+    from mmgsd.extras.exporting import export_onnx
 
     difference = export_onnx(mmgsd.load(asked.weights), asked.out)
     print(f"{asked.out}: images of any size in, descriptors as of Matcher.describe out, the mean over quarter turns "
@@ -124,8 +124,8 @@ def _draw(answer: Any, path: Path) -> None:
     import matplotlib
 
     matplotlib.use("Agg")
+    from mmgsd.figures.plots import plot_page
     from mmgsd.files import writing
-    from mmgsd.plots import plot_page
 
     figure = answer.plot() if len(answer) == 1 else plot_page(answer)
     with writing(path) as aside:

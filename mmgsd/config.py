@@ -61,7 +61,7 @@ def _check(name: str, value: Any, accepted: str, ok: bool) -> None:
 def _check_object(name: str) -> None:
     """The cloth, the rope, or a name that an object of the user's own may have, whether its file is there yet or not.
 
-    Where it is needed and missing, `mmgsd.sheet.load_sheet` gives the nearest name.
+    Where it is needed and missing, `mmgsd.scene.sheet.load_sheet` gives the nearest name.
     """
     accepted = (f"{', '.join(map(repr, OBJECTS))} or the name of a file in data/objects: up to 60 letters, digits, "
                 "- and _, a letter first")  # fmt: skip
@@ -120,7 +120,7 @@ class RenderConfig:
     under hard light, seen obliquely, with prints, hems and stickers on the object, or without it (`mmgsd.scene`).
     """
 
-    object: str = "cloth"  # or "rope", or the name of a file in data/objects (see `mmgsd.sheet`)
+    object: str = "cloth"  # or "rope", or the name of a file in data/objects (see `mmgsd.scene.sheet`)
     train_images: int = 60
     test_images: int = 20
     views: int = 10  # images of one simulation, each with its own camera, light and material
@@ -177,9 +177,9 @@ class TrainConfig:
     augment: bool = True
     bend: float = 0.0  # augmentation stretches and squeezes images along random waves, by up to this share
     rotate: bool = True  # augmentation turns images by any angle; off where the rotation limit is the experiment
-    roundness: float = ROUNDNESS  # of the modes read from its heatmaps, a priori (`mmgsd.mixture.fit_modes`)
-    heads: bool = False  # it also learns where the object is, what is seen and whether it is there (`mmgsd.heads`)
-    clutter: bool = False  # augmentation changes backgrounds and puts things in front (`mmgsd.compositing`)
+    roundness: float = ROUNDNESS  # of the modes read from its heatmaps, a priori (`mmgsd.match.mixture.fit_modes`)
+    heads: bool = False  # it also learns where the object is, what is seen and whether it is there (`learn.heads`)
+    clutter: bool = False  # augmentation changes backgrounds and puts things in front (`learn.compositing`)
     also: str = ""  # preset whose images of the object are trained on besides the data set's own, or ""
     seed: int = 0
 

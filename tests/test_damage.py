@@ -15,16 +15,20 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from mmgsd import matrix, packing, report, shipping, tables, training
 from mmgsd.config import EvaluateConfig, TrainConfig, load_preset
 from mmgsd.dataset import check_dataset
 from mmgsd.dataset_format import TABLES
-from mmgsd.evaluation import evaluate_baseline, load_queries, write_results
-from mmgsd.figure_data import FigureData, load_figure_data, save_figure_data
+from mmgsd.extras import packing, shipping
 from mmgsd.files import DamagedFileError
-from mmgsd.matching import Match
-from mmgsd.metrics import ErrorSummary
-from mmgsd.training import CHECKPOINT, WEIGHTS, train_model
+from mmgsd.learn import training
+from mmgsd.learn.training import CHECKPOINT, WEIGHTS, train_model
+from mmgsd.match.matcher import Match
+from mmgsd.measure import matrix
+from mmgsd.measure.evaluation import evaluate_baseline, load_queries, write_results
+from mmgsd.measure.figure_data import FigureData, load_figure_data, save_figure_data
+from mmgsd.measure.metrics import ErrorSummary
+from mmgsd.report import latex as report
+from mmgsd.report import tables
 
 CONFIG = TrainConfig(steps=1, batch=4, pairs=6, queries=16, input_px=64, descriptor_dim=8)
 ASKED = EvaluateConfig(pairs=1, points=3)

@@ -14,8 +14,8 @@ from PIL import Image
 from mmgsd.__main__ import main
 from mmgsd.config import TrainConfig
 from mmgsd.dataset import load_dataset
-from mmgsd.matching import Matcher, load
-from mmgsd.training import train_model
+from mmgsd.learn.training import train_model
+from mmgsd.match.matcher import Matcher, load
 
 CONFIG = TrainConfig(steps=1, batch=2, pairs=2, queries=4, input_px=64, descriptor_dim=4)
 
@@ -161,7 +161,7 @@ def test_onnx_gives_the_same_descriptors_for_any_size(weights, capsys, tmp_path)
 
 
 def test_nothing_is_left_of_an_export_that_differs(weights, capsys, tmp_path, monkeypatch):
-    monkeypatch.setattr("mmgsd.exporting._compare", lambda *_: 1.0)
+    monkeypatch.setattr("mmgsd.extras.exporting._compare", lambda *_: 1.0)
     said = fail(capsys, 1, "export", tmp_path / "cloth.onnx", "--weights", weights)
     assert "descriptors differ from torch's by 1.0e+00" in said
     assert list(tmp_path.iterdir()) == []

@@ -16,6 +16,7 @@ from PIL import Image
 
 from mmgsd import parameters
 from mmgsd.config import Paths, TrainConfig
+from mmgsd.learn.training import train_model
 from mmgsd.parameters import (
     check_images,
     check_made,
@@ -30,7 +31,6 @@ from mmgsd.parameters import (
     read_scheduler,
     whole,
 )
-from mmgsd.training import train_model
 
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
@@ -280,7 +280,7 @@ def test_training_asks_for_the_images_that_were_left_out(empty_root, notebook):
     [
         ("04_evaluate", {}, "run 03_train for it first"),
         ("06_uncertainty", {}, "run 03_train for it first"),
-        ("09_error_analysis", {"method": "pcl"}, "for preset='smoke', method='pcl' there is no .* -m mmgsd.matrix"),
+        ("09_error_analysis", {"method": "pcl"}, "for preset='smoke', method='pcl' there is no .*measure.matrix"),
     ],
 )
 def test_a_method_that_is_not_trained_is_named(empty_root, notebook, told, by):

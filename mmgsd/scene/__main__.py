@@ -27,7 +27,7 @@ from PIL import Image
 
 from mmgsd.config import RenderConfig, from_dict
 from mmgsd.files import writing
-from mmgsd.sheet import Sheet
+from mmgsd.scene.sheet import Sheet
 
 WEBP = {"lossless": True, "quality": 20, "method": 0}  # 25 ms an image; more effort saves a few per cent of space
 PR_SET_PDEATHSIG = 1  # of Linux: which signal a process gets when its parent ends

@@ -13,10 +13,10 @@ import numpy as np
 from mathutils.bvhtree import BVHTree
 
 from mmgsd.config import RenderConfig
-from mmgsd.meshes import SPACING
 from mmgsd.scene import SceneError
+from mmgsd.scene.meshes import SPACING
 from mmgsd.scene.render import DeformedObject, add_mesh, read_vertices
-from mmgsd.sheet import Sheet
+from mmgsd.scene.sheet import Sheet
 from mmgsd.symmetry import grid_group
 
 SIDE = 37  # simulated vertices a side; with 49 a frame takes nearly twice as long

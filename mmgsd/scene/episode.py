@@ -10,7 +10,7 @@ import numpy as np
 from mmgsd.config import OBJECTS, SCENES, RenderConfig
 from mmgsd.scene import randomize, render
 from mmgsd.scene.render import DeformedObject, View
-from mmgsd.sheet import Sheet
+from mmgsd.scene.sheet import Sheet
 
 SPLITS = ("train", "test")
 

@@ -22,9 +22,9 @@ import pandas as pd
 
 from mmgsd.config import METHODS, OBJECTS, Paths, TrainConfig, find_root, load_preset
 from mmgsd.dataset import hold_out, load_dataset
-from mmgsd.evaluation import measure_rmse
-from mmgsd.matching import Matcher
-from mmgsd.training import LOG, load_metadata, train_model
+from mmgsd.learn.training import LOG, load_metadata, train_model
+from mmgsd.match.matcher import Matcher
+from mmgsd.measure.evaluation import measure_rmse
 
 PACE_STEPS = 20  # steps that the pace is measured on, after as many to warm up
 

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from mmgsd.config import OBJECTS, EvaluateConfig, Paths, find_root, load_preset
-from mmgsd.evaluation import evaluate_model, load_queries
-from mmgsd.packing import unpack_dataset
-from mmgsd.training import WEIGHTS
+from mmgsd.extras.packing import unpack_dataset
+from mmgsd.learn.training import WEIGHTS
+from mmgsd.measure.evaluation import evaluate_model, load_queries
 
 QUESTIONS = EvaluateConfig(pairs=100, points=125)
 

@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 from mmgsd.config import OBJECTS, RenderConfig
-from mmgsd.rendering import render_dataset
+from mmgsd.scene.rendering import render_dataset
 
 SEED = 1234  # not a preset's: nobody trains on these
 SPLIT = """

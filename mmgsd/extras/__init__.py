@@ -1,0 +1,1 @@
+"""The explorer, ONNX, packing and shipping: to be skipped on first reading."""

@@ -1,0 +1,128 @@
+"""What the explorer opens: pairs of images with what is known of them, and the methods that answer."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mmgsd.config import OBJECTS, PRESETS, Paths, find_root, load_preset
+from mmgsd.dataset import Dataset, load_dataset, sample_pairs
+from mmgsd.figures.style import METHOD_LABELS
+from mmgsd.images import decode_image, to_rgb
+from mmgsd.learn.training import WEIGHTS
+from mmgsd.match.baselines import BaselineMatcher, list_baselines
+from mmgsd.match.matcher import Matcher
+from mmgsd.parameters import find_file
+
+SNAP_PX = 12.0  # a click so near to a material point shows that point's true matches
+SAMPLE = "sample"  # the preset of the images in data/sample
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A pair of images and, where they are known, the labels of the first and the matches in the second."""
+
+    image0: np.ndarray  # (H0, W0, 3) uint8
+    image1: np.ndarray  # (H1, W1, 3) uint8
+    name0: str = "your image"
+    name1: str = "your image"
+    mask1: np.ndarray | None = None  # (H1, W1) bool, which hand-made descriptors need
+    xy0: np.ndarray | None = None  # (P, 2) px of the material points
+    orbits: list[np.ndarray] | None = None  # true matches (n, 2) px of each
+
+    def find_truth(self, xy: np.ndarray) -> np.ndarray:
+        """True matches (n, 2) px of the material point nearest to a pixel (2,); none where it is far or unknown."""
+        if self.xy0 is None:
+            return np.empty((0, 2))
+        apart = np.linalg.norm(self.xy0 - xy, axis=1)
+        return self.orbits[int(apart.argmin())] if apart.min() <= SNAP_PX else np.empty((0, 2))
+
+    def replace_image(self, side: int, image: np.ndarray, name: str) -> Scene:
+        """The pair with another first (0) or second (1) image, of any kind that `Matcher.match` takes.
+
+        Nothing is known of its matches any more.
+        """
+        other = {f"image{side}": to_rgb(image, f"image{side}"), f"name{side}": name, "xy0": None, "orbits": None}
+        return dataclasses.replace(self, **other, mask1=self.mask1 if side == 0 else None)
+
+
+def make_scenes(data: Dataset, *, pairs: int = 50, seed: int = 0) -> list[Callable[[], Scene]]:
+    """Pairs of images of a data set's split, read when they are looked at."""
+    group = data.group()
+
+    def make(first: int, second: int) -> Scene:
+        orbits = [data.xy[second][group.distinct_modes(point)] for point in range(group.n_points)]
+        names = (f"{data.object}, image {index}" for index in (first, second))
+        images = data.load_image(first), data.load_image(second)
+        seen = np.where(data.visible[first][:, None], data.xy[first], np.inf)
+        return Scene(*images, *names, data.load_mask(second), seen, orbits)
+
+    chosen = sample_pairs(data.episode, pairs, np.random.default_rng(seed), present=data.present)
+    return [lambda a=int(a), b=int(b): make(a, b) for a, b in chosen]
+
+
+def make_own_scene(image0: np.ndarray, image1: np.ndarray) -> Scene:
+    """A scene of a user's own images, of any kind that `Matcher.match` takes."""
+    return Scene(to_rgb(image0, "image0"), to_rgb(image1, "image1"))
+
+
+def choose_scenes(name: str, preset: str = SAMPLE, own_images: Sequence[Path | str] = ()) -> list:
+    """The pairs to open for an object: two image files where ``own_images`` names them, else test images of a data set.
+
+    ``preset``: "sample" for the images that come with the repository, or a preset whose data set has been rendered.
+    Relative paths are those of `find_file`. ValueError names the argument that is wrong.
+    """
+    _check_choice("name", name, OBJECTS)
+    _check_choice("preset", preset, (SAMPLE, *PRESETS))
+    if isinstance(own_images, str | bytes) or not isinstance(own_images, Sequence) or len(own_images) not in (0, 2):
+        raise ValueError(f"own_images must be [] or a list of two image files, got {own_images!r}")
+    if own_images:
+        files = [find_file(path, f"own_images[{k}]") for k, path in enumerate(own_images)]
+        images = [decode_image(file.read_bytes(), file.name) for file in files]
+        return [Scene(*images, *(file.name for file in files))]
+    return make_scenes(load_dataset(_find_dataset(name, preset), "test"))
+
+
+def load_matchers(name: str, preset: str = SAMPLE) -> dict[str, Any]:
+    """{label: matcher} for an object: the shipped models, those trained here with a preset, hand-made descriptors.
+
+    With the preset "sample", the ones that are trained with "quick".
+    """
+    _check_choice("name", name, OBJECTS)
+    _check_choice("preset", preset, (SAMPLE, *PRESETS))
+    trained = Paths(find_root(), "quick" if preset == SAMPLE else preset)
+    matchers = load_shipped(name)
+    for method, config in load_preset(trained.preset).main_table(name).items():
+        path = trained.model(config) / WEIGHTS
+        if path.is_file():
+            matchers[f"{METHOD_LABELS.get(method, method)} ({trained.preset})"] = Matcher.load(path)
+    return matchers | {METHOD_LABELS[method]: BaselineMatcher(method) for method in list_baselines()}
+
+
+def load_shipped(name: str) -> dict[str, Matcher]:
+    """{label: matcher} of every model in data/weights that is of the object: ``NAME`` (MMGSD) and ``NAME-METHOD``."""
+    matchers = {}
+    folder = find_root() / "data" / "weights"
+    for path in sorted(folder.glob("*.safetensors"), key=lambda path: path.stem):
+        method = "mmgsd" if path.stem == name else path.stem.removeprefix(f"{name}-")
+        if method == path.stem:
+            continue
+        matcher = Matcher.load(path)
+        if matcher.config.object == name:
+            matchers[METHOD_LABELS.get(method, method)] = matcher
+    return matchers
+
+
+def _find_dataset(name: str, preset: str) -> Path:
+    root = find_root()
+    return root / "data" / "sample" / name if preset == SAMPLE else Paths(root, preset).dataset(name)
+
+
+def _check_choice(argument: str, value: Any, choices: Sequence[str]) -> None:
+    if value not in choices:
+        raise ValueError(f"{argument} must be one of {', '.join(map(repr, choices))}, got {value!r}")

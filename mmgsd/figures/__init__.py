@@ -1,0 +1,1 @@
+"""Drawing: every function returns a Figure."""

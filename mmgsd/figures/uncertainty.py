@@ -1,0 +1,93 @@
+"""Figures of `mmgsd.measure.uncertainty`, in the style of `mmgsd.figures.plots`: each returns a ``Figure``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+import pandas as pd
+from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from mmgsd.figures.style import CHANCE_STYLES, COLUMN_IN, add_legend, check_filled, finish_axes, get_line_style, styled
+from mmgsd.measure.uncertainty import LEVELS, compute_coverage, compute_risk_coverage, get_distances
+
+CURVE_POINTS = 200  # of a risk-coverage curve: a PDF of all queries would be large
+_ORDER = ("mmgsd", "unimodal", "spcl", "pcl", "sift", "orb")
+_THIN = {"linestyle": (0, (4, 1.5)), "linewidth": 0.8}
+
+Tables = Mapping[str, Mapping[str, pd.DataFrame]]
+
+
+@styled
+def plot_risk_coverage(queries: Tables) -> Figure:
+    """Mean error of the queries kept against their share, least entropy first; dashed: MMGSD ordered by its errors.
+
+    ``queries`` {object: {method: table}}, a panel an object, a line a method; chance, which is never certain, is left
+    out, as are queries with a hidden source. ValueError where there are none.
+    """
+    figure, axes = _make_panels("queries", queries)
+    for axis, (name, methods) in zip(axes, queries.items(), strict=True):
+        for method in _sort_methods(methods):
+            seen = methods[method][methods[method].visible]
+            style = get_line_style(method)
+            _draw_risk(axis, seen.rmse_px, seen.entropy, style)
+            if method == "mmgsd":
+                _draw_risk(axis, seen.rmse_px, seen.rmse_px, style | _THIN | {"label": f"{style['label']}, oracle"})
+        axis.set(title=name.capitalize(), xlabel="Queries kept (%)", xlim=(0, 100), ylim=(0, None))
+    axes[0].set_ylabel("Mean RMSE (px)")
+    add_legend(figure, axes)
+    return finish_axes(figure)
+
+
+@styled
+def plot_calibration(before: Tables, after: Tables) -> Figure:
+    """Share of true matches inside the ellipses against the share a Gaussian has there; grey: perfectly calibrated.
+
+    ``before`` (thin, dashed) and ``after`` (solid) the temperature's calibration, {object: {method: table}} of the same
+    objects; a method in one of them only has that line only. ValueError for other objects, or none.
+    """
+    if list(before) != list(after):
+        raise ValueError(f"before and after must have the same objects, got {list(before)} and {list(after)}")
+    figure, axes = _make_panels("before", before)
+    for axis, name in zip(axes, before, strict=True):
+        check_filled(f"after[{name!r}]", after[name])
+        axis.plot([0, 100], [0, 100], color="0.75", lw=0.8, zorder=1)
+        for method in _sort_methods(after[name]):
+            _draw_coverage(axis, after[name][method], get_line_style(method))
+        for method in _sort_methods(before[name]):
+            label = "" if method in after[name] else get_line_style(method)["label"]
+            _draw_coverage(axis, before[name][method], get_line_style(method) | _THIN | {"label": label})
+        axis.set(title=name.capitalize(), xlabel="Expected coverage (%)", xlim=(0, 100), ylim=(0, 100), aspect="equal",
+                 xticks=range(0, 101, 25), yticks=range(0, 101, 25))  # fmt: skip
+    axes[0].set_ylabel("Observed coverage (%)")
+    axes[0].plot([], [], color="0.3", label="Before calibration", **_THIN)
+    add_legend(figure, axes)
+    return finish_axes(figure)
+
+
+def _make_panels(name: str, tables: Tables) -> tuple[Figure, np.ndarray]:
+    """A row of axes, one an object; ValueError where there is no object, or one without methods."""
+    check_filled(name, tables)
+    for key, methods in tables.items():
+        check_filled(f"{name}[{key!r}]", methods)
+    figure, axes = plt.subplots(1, len(tables), figsize=(COLUMN_IN, 2.2), layout="constrained", squeeze=False)
+    figure.get_layout_engine().set(h_pad=0.04)  # the legend keeps its distance from the axes' labels
+    return figure, axes[0]
+
+
+def _sort_methods(methods: Iterable[str]) -> list[str]:
+    """The methods that are not chance: those of the paper's tables in their order, then others."""
+    others = [m for m in methods if m not in _ORDER and m not in CHANCE_STYLES]
+    return [m for m in _ORDER if m in methods] + others
+
+
+def _draw_risk(axis: Axes, error: pd.Series, score: pd.Series, style: dict) -> None:
+    coverage, risk = compute_risk_coverage(error, score)
+    chosen = np.unique((np.arange(1, CURVE_POINTS + 1) * len(risk) - 1) // CURVE_POINTS)  # the last always
+    axis.plot(100 * coverage[chosen], risk[chosen], **style)
+
+
+def _draw_coverage(axis: Axes, queries: pd.DataFrame, style: dict) -> None:
+    axis.plot(100 * np.array(LEVELS), 100 * compute_coverage(get_distances(queries)), **style)

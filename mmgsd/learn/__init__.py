@@ -1,0 +1,1 @@
+"""Learning: the network, its losses and the training."""

@@ -1,0 +1,217 @@
+"""Training images in memory, and augmented batches of them: labels move as the pixels do."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from mmgsd.config import TrainConfig
+from mmgsd.dataset import Dataset
+from mmgsd.learn.compositing import composite, disturb
+from mmgsd.learn.network import compute_input_size
+
+CACHE_SCALE = 1.25  # images are kept in memory at this multiple of the network's input size
+WAVES = 4  # that bend an image
+BEND_ITERATIONS = 12
+
+
+@dataclass(frozen=True)
+class TrainingImages:
+    """A data set's images in memory at about the network's resolution, labels in full-image px."""
+
+    images: list[np.ndarray]  # N of (h, w, 3) uint8
+    masks: list[np.ndarray]  # N of (h, w) uint8, 255 on the object
+    xy: np.ndarray  # (N, P, 2) px
+    visible: np.ndarray  # (N, P) bool
+    size: tuple[int, int]  # full (W, H) px
+    mirror: np.ndarray | None = None  # (P,) where each point goes in a mirror image
+    present: np.ndarray | None = None  # (N,) bool, images that show the object; None: all of them
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Augmented images as tensors."""
+
+    image: Tensor  # (B, 3, h, w) in [0, 1]
+    mask: Tensor  # (B, h, w) bool
+    xy: Tensor  # (B, P, 2) full-image px
+    askable: Tensor  # (B, P) bool, points visible and inside
+    inside: Tensor  # (B, P) bool, visible or not; none where the object is not present
+
+
+@dataclass(frozen=True)
+class Warp:
+    """A smooth map of the image plane, in full-image px: an affine one, then gentle waves that bend it.
+
+    Built from where a pixel of the new image comes from, ``find_source``; ``move`` is the inverse.
+    """
+
+    affine: np.ndarray  # (2, 3)
+    amplitudes: np.ndarray  # (K, 2) px
+    wave_vectors: np.ndarray  # (K, 2) rad/px
+    phases: np.ndarray  # (K,) rad
+
+    def find_source(self, xy: np.ndarray) -> np.ndarray:
+        """Old px of new px (..., 2)."""
+        inverse = np.linalg.inv(self.affine[:, :2])
+        return (xy + self._bend(xy) - self.affine[:, 2]) @ inverse.T
+
+    def find_grid_source(self, columns: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """`find_source` of every pixel of a grid, (rows, columns, 2): the sine of a sum by the sines of its parts."""
+        across = columns[:, None] * self.wave_vectors[:, 0]  # (columns, K)
+        down = rows[:, None] * self.wave_vectors[:, 1] + self.phases  # (rows, K)
+        parts = np.concatenate([np.cos(down), np.sin(down)], axis=1)  # (rows, 2 K)
+        waves = np.concatenate([np.sin(across), np.cos(across)], axis=1)  # (columns, 2 K)
+        bend = np.einsum("rk,ck,kd->rcd", parts, waves, np.tile(self.amplitudes, (2, 1)), optimize=True)
+        asked = np.stack(np.meshgrid(columns, rows), axis=-1) + bend
+        return (asked - self.affine[:, 2]) @ np.linalg.inv(self.affine[:, :2]).T
+
+    def move(self, xy: np.ndarray) -> np.ndarray:
+        """New px of old px (..., 2); exact to 0.02 px."""
+        straight = xy @ self.affine[:, :2].T + self.affine[:, 2]
+        moved = straight
+        for _ in range(BEND_ITERATIONS):  # a contraction: the waves' slopes sum to 0.5 at most
+            moved = straight - self._bend(moved)
+        return moved
+
+    def mirrored(self, width: int) -> Warp:
+        """The same after the old image was mirrored, columns backwards."""
+        return dataclasses.replace(self, affine=self.affine @ [[-1, 0, width - 1], [0, 1, 0], [0, 0, 1]])
+
+    def _bend(self, xy: np.ndarray) -> np.ndarray:
+        return np.sin(xy @ self.wave_vectors.T + self.phases) @ self.amplitudes
+
+
+UNCHANGED = Warp(np.eye(2, 3), np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
+
+
+def sample_warp(
+    size: tuple[int, int], rng: np.random.Generator, *,
+    rotate: bool = True, scale: float = 0.2, shift: float = 0.06, bend: float = 0.0,
+) -> Warp:  # fmt: skip
+    """A random similarity of the image plane about the image's centre, bent by ``WAVES`` random waves.
+
+    Angle uniform over the circle (0 without ``rotate``), size times exp(± ``scale``), moved by up to ``shift`` of the
+    image's size; the waves are half to a whole image long and stretch or squeeze by up to ``bend`` in all.
+    """
+    width, height = size
+    angle = rng.uniform(-np.pi, np.pi) if rotate else 0.0
+    zoom = np.exp(rng.uniform(-scale, scale))
+    cosine, sine = zoom * np.cos(angle), zoom * np.sin(angle)
+    linear = np.array([[cosine, -sine], [sine, cosine]])
+    centre = np.array([(width - 1) / 2, (height - 1) / 2])
+    move = rng.uniform(-shift, shift, 2) * (width, height)
+    affine = np.column_stack([linear, centre - linear @ centre + move])
+    direction, towards = rng.uniform(0, 2 * np.pi, (2, WAVES))
+    number = rng.uniform(1, 2, WAVES) * 2 * np.pi / max(size)  # rad/px
+    amplitude = rng.uniform(0, bend / WAVES, WAVES) / number
+    waves, pushes = (np.stack([np.cos(a), np.sin(a)], axis=-1) for a in (direction, towards))
+    return Warp(affine, amplitude[:, None] * pushes, number[:, None] * waves, rng.uniform(0, 2 * np.pi, WAVES))
+
+
+def warp_images(
+    images: Sequence[np.ndarray], warp: Warp, full: tuple[int, int], size: tuple[int, int]
+) -> list[np.ndarray]:
+    """Apply a ``warp`` to (possibly smaller) copies of an image and resample them to ``size``.
+
+    ``images`` (h, w, 3) uint8 or (h, w) uint8, all of one resolution, of an image of ``full`` = (W, H) px. What
+    enters from outside is mirrored background, or nothing (0) for a mask. Returns (size[1], size[0], …) each.
+    """
+    columns, rows = (_scale(np.arange(n), n, whole) for n, whole in zip(size, full, strict=True))
+    found = warp.find_grid_source(columns, rows)
+    source = _scale(found, full, images[0].shape[1::-1]).astype(np.float32)
+    borders = [cv2.BORDER_CONSTANT if image.ndim == 2 else cv2.BORDER_REFLECT_101 for image in images]
+    return [cv2.remap(image, source, None, cv2.INTER_LINEAR, borderMode=border)
+            for image, border in zip(images, borders, strict=True)]  # fmt: skip
+
+
+def _scale(positions: np.ndarray, source: ArrayLike, target: ArrayLike) -> np.ndarray:
+    """Px of an image with ``source`` px a side as px of its copy with ``target``, pixel centres integer."""
+    return (positions + 0.5) * (np.asarray(target) / np.asarray(source)) - 0.5
+
+
+def jitter_colours(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Random gain and offset of each channel, gamma, mixed channels and noise, on (h, w, 3) uint8; returns uint8."""
+    values = np.arange(256) / 255
+    gamma, gain, offset = np.exp(rng.uniform(-0.3, 0.3)), rng.uniform(0.75, 1.25, 3), rng.uniform(-0.08, 0.08, 3)
+    table = values[:, None] ** gamma * gain + offset  # (256, 3)
+    table = (table.clip(0, 1) * 255).astype(np.uint8)
+    image = np.stack([table[image[..., c], i] for i, c in enumerate(rng.permutation(3))], axis=-1)
+    if rng.random() < 0.5:
+        noise = rng.normal(0, rng.uniform(0, 10), image.shape)
+        image = (image + noise).clip(0, 255).astype(np.uint8)
+    return image
+
+
+def load_training_images(data: Dataset, input_px: int, *, indices: np.ndarray | None = None) -> TrainingImages:
+    """Read images and masks once, reduced to a little more than the network's input size."""
+    indices = np.arange(len(data)) if indices is None else indices
+    width, height = (round(s * CACHE_SCALE) for s in compute_input_size(data.size, input_px))
+
+    def load(index: int) -> tuple[np.ndarray, np.ndarray]:
+        image, mask = data.load_image(index), data.load_mask(index).astype(np.uint8) * 255
+        return tuple(cv2.resize(a, (width, height), interpolation=cv2.INTER_AREA) for a in (image, mask))
+
+    with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
+        images, masks = zip(*pool.map(load, indices), strict=True)
+    labels = data.xy[indices], data.visible[indices]
+    return TrainingImages(list(images), list(masks), *labels, data.size, data.mirror, data.present[indices])
+
+
+def make_batch(
+    images: TrainingImages, indices: np.ndarray, config: TrainConfig, rng: np.random.Generator, device: torch.device
+) -> Batch:
+    """Augment the images ``indices`` (B,), labels with them, and move them to the device.
+
+    Half of them are mirrored where the object has a mirror image; with ``config.clutter`` they are also put together
+    anew (`mmgsd.learn.compositing`).
+    """
+    made = [_make_one(images, int(index), config, rng) for index in indices]
+    image, mask, xy, visible, present = (np.stack(values) for values in zip(*made, strict=True))
+    inside = np.all((xy > -0.5) & (xy < np.array(images.size) - 0.5), axis=-1) & present[:, None]
+    image = torch.from_numpy(image).to(device).permute(0, 3, 1, 2).float() / 255
+    tensors = (torch.from_numpy(a).to(device) for a in (mask, xy.astype(np.float32), inside & visible, inside))
+    return Batch(image, *tensors)
+
+
+Labelled = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, bool]  # image, mask, xy, visible, present
+
+
+def _make_one(images: TrainingImages, index: int, config: TrainConfig, rng: np.random.Generator) -> Labelled:
+    """One augmented image (h, w, 3) uint8, its mask (h, w) bool, points (P, 2) px, which are visible, and presence."""
+    size, warp, xy = compute_input_size(images.size, config.input_px), UNCHANGED, images.xy[index]
+    visible, present = images.visible[index], images.present is None or bool(images.present[index])
+    if config.augment:
+        warp = sample_warp(images.size, rng, rotate=config.rotate, bend=config.bend)
+        if images.mirror is not None and rng.random() < 0.5:
+            warp = warp.mirrored(images.size[0])
+            xy, visible = xy[images.mirror], visible[images.mirror]
+    image, mask = warp_images([images.images[index], images.masks[index]], warp, images.size, size)
+    xy = warp.move(xy)
+    if config.clutter:
+        made = composite(image, mask, lambda: _borrow(images, rng), rng)
+        image, mask, present = made.image, made.mask, present and made.present
+        visible = visible & ~_look_up(made.covered, xy, images.size) & present
+    image = jitter_colours(image, rng) if config.augment else image
+    return disturb(image, rng) if config.clutter else image, mask > 127, xy, visible, present
+
+
+def _borrow(images: TrainingImages, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Another image with its mask."""
+    index = int(rng.integers(len(images.images)))
+    return images.images[index], images.masks[index]
+
+
+def _look_up(covered: np.ndarray, xy: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Which of the px (P, 2) of an image of ``size`` are covered in its copy (h, w) bool."""
+    columns, rows = np.rint(_scale(xy, size, covered.shape[::-1])).astype(int).T
+    return covered[rows.clip(0, covered.shape[0] - 1), columns.clip(0, covered.shape[1] - 1)]

@@ -1,0 +1,150 @@
+"""What a training leaves in its folder: weights, checkpoint and log, whole or not at all, and for one run at a time."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from mmgsd.config import TrainConfig, from_dict
+from mmgsd.dataset import Dataset, join_datasets, load_parts
+from mmgsd.files import DamagedFileError, LockedError, locked, remove_leftovers, write_bytes
+from mmgsd.learn.distributed import Team
+
+WEIGHTS, CHECKPOINT, LOG = "weights.safetensors", "checkpoint.safetensors", "log.csv"
+REMEDY = "train it again (overwrite=True), or restore it where it was shipped"
+
+
+def is_trained(weights: Path, dataset: Path, *, also: str = "") -> bool:
+    """Whether the weights are there; ValueError where they are of other data than `load_parts` finds."""
+    if not weights.is_file():
+        return False
+    if load_metadata(weights).get("data") != join_datasets(*load_parts(dataset, "test", also=also)).fingerprint:
+        raise ValueError(f"{weights} was trained on another data set than {dataset}: use overwrite=True")
+    return True
+
+
+@contextmanager
+def held(folder: Path, team: Team) -> Iterator[None]:
+    """The folder, locked by the team's first process; LockedError in all of them where another run holds it."""
+    with ExitStack() as stack:
+        refused = None
+        if team.rank == 0:
+            try:
+                stack.enter_context(locked(folder, "training"))
+            except LockedError as error:
+                refused = error
+        if team.add(float(refused is not None)):
+            raise refused or LockedError(f"{folder} is in use: the first process says by whom")
+        yield
+
+
+def remove_run(folder: Path) -> None:
+    """Remove what a training writes, the weights last: without them a folder is not taken for finished."""
+    for name in (CHECKPOINT, f"{CHECKPOINT}.tmp", f"{CHECKPOINT}.damaged", LOG, WEIGHTS):
+        (folder / name).unlink(missing_ok=True)
+        if folder.is_dir():
+            remove_leftovers(folder, name)
+
+
+def check_enough(data: Dataset, held_out: Dataset) -> None:
+    """ValueError before training, not after it, where calibration could make no pair of the images held out."""
+    if held_out.present.sum() < 2:
+        raise ValueError(
+            f"{data.folder} must hold at least 2 training images of each simulation, or 30 simulations of one view "
+            f"each, so that 2 can be held out: got {len(data)} images of {len(np.unique(data.episode))} simulations"
+        )
+
+
+def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> Path:
+    """Write a safetensors file whole or not at all; OSError names the path where the disk is full."""
+    return write_bytes(path, save({name: value.contiguous() for name, value in tensors.items()}, dict(metadata)))
+
+
+def read_tensors(path: Path | str, device: str = "cpu") -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Tensors and note of a safetensors file; DamagedFileError, which names it, where it is damaged or none."""
+    try:
+        with safe_open(path, "pt", device=device) as file:
+            return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
+    except FileNotFoundError:
+        raise
+    except (SafetensorError, OSError) as error:
+        raise DamagedFileError(f"{path} is truncated or no safetensors file ({error}): {REMEDY}") from error
+
+
+def load_metadata(weights: Path | str) -> dict[str, str]:
+    """What a weights file says of itself: ``config``, ``seconds`` of training, ``hardware``, ``images``, …
+
+    FileNotFoundError where there is none, DamagedFileError where it is damaged.
+    """
+    try:
+        with safe_open(weights, "pt") as file:
+            return file.metadata() or {}
+    except FileNotFoundError:
+        raise
+    except (SafetensorError, OSError) as error:
+        raise DamagedFileError(f"{weights} is truncated or no safetensors file ({error}): {REMEDY}") from error
+
+
+def read_config(weights: Path | str) -> tuple[TrainConfig, dict[str, str]]:
+    """The configuration that weights were trained with, and all that they say; DamagedFileError if they say none."""
+    note = load_metadata(weights)
+    try:
+        return from_dict(TrainConfig, json.loads(note["config"])), note
+    except (KeyError, ValueError, TypeError, AttributeError) as error:
+        raise DamagedFileError(f"{weights} names no configuration known here ({error}): {REMEDY}") from error
+
+
+def describe_run(weights: Path | str) -> dict[str, int | float | str]:
+    """Which model it is and what it cost: its name, steps, minutes, training images, seed, hardware."""
+    config, note = read_config(weights)
+    try:
+        minutes, images, hardware = round(float(note["seconds"]) / 60, 2), int(note["images"]), note["hardware"]
+    except (KeyError, ValueError) as error:
+        raise DamagedFileError(f"{weights} does not say what it cost ({error}): {REMEDY}") from error
+    run = {"model": config.name, "steps": config.steps, "minutes": minutes, "images": images}
+    return {**run, "seed": config.seed, "hardware": hardware}
+
+
+def write_checkpoint(path: Path, tensors: Mapping[str, Tensor], config: str, numbers: dict[str, Any]) -> Path:
+    """Write a training's state, with a checksum of all of it."""
+    metadata = {"config": config, "numbers": json.dumps(numbers)}
+    return write_tensors(path, tensors, {**metadata, "sha256": _hash(tensors, metadata)})
+
+
+def read_checkpoint(path: Path, like: Mapping[str, Tensor], device: str) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """What `write_checkpoint` wrote; DamagedFileError where it is damaged, or lacks a tensor of the shapes ``like``.
+
+    One of before there were checksums is read without.
+    """
+    tensors, metadata = read_tensors(path, device)
+    said = {name: metadata.get(name, "") for name in ("config", "numbers")}
+    if "sha256" in metadata and metadata["sha256"] != _hash(tensors, said):
+        raise DamagedFileError(f"{path} is damaged: its checksum is another")
+    if not all(name in tensors and tensors[name].shape == value.shape for name, value in like.items()):
+        raise DamagedFileError(f"{path} is damaged: it lacks a part of the network")
+    try:
+        fits = {"step", "seconds", "log"} <= json.loads(said["numbers"]).keys()
+    except (ValueError, AttributeError):
+        fits = False
+    if not fits:
+        raise DamagedFileError(f"{path} is damaged: it does not say how far the training was")
+    return tensors, metadata
+
+
+def _hash(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> str:
+    digest = hashlib.sha256(json.dumps(metadata, sort_keys=True).encode())
+    for name in sorted(tensors):
+        value = tensors[name].detach().contiguous().reshape(-1).cpu()
+        digest.update(f"{name} {tuple(tensors[name].shape)} {value.dtype}".encode())
+        digest.update(value.view(torch.uint8).numpy().data)
+    return digest.hexdigest()

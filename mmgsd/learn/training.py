@@ -1,0 +1,337 @@
+"""The one training loop for all methods."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import torch
+from torch import Tensor
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+from torch.utils import deterministic
+from tqdm.auto import tqdm
+
+from mmgsd.config import CONTRASTIVE, DETAILED, MATCHES_OF_ONE, PASSES, TrainConfig, read_count, read_flag
+from mmgsd.dataset import Dataset, hold_out, join_datasets, load_parts
+from mmgsd.files import DamagedFileError, saying_what_stays, set_aside, write_text
+from mmgsd.learn import distributed
+from mmgsd.learn.augmentation import Batch, load_training_images, make_batch
+from mmgsd.learn.checkpoints import (
+    CHECKPOINT,
+    LOG,
+    WEIGHTS,
+    check_enough,
+    held,
+    is_trained,
+    read_checkpoint,
+    remove_run,
+    write_checkpoint,
+    write_tensors,
+)
+from mmgsd.learn.checkpoints import describe_run as describe_run  # what others ask of a training
+from mmgsd.learn.checkpoints import load_metadata as load_metadata
+from mmgsd.learn.network import build_network, find_device, sample_descriptors
+from mmgsd.learn.objective import compute_head_loss, compute_loss
+from mmgsd.learn.optimiser import make_optimisers
+from mmgsd.learn.prototypes import compute_prototype_loss, make_prototypes
+from mmgsd.match.matcher import Matcher, load
+from mmgsd.measure.evaluation import calibrate_bandwidth, calibrate_temperature, measure_rmse
+
+PROTOTYPE_EVERY = 4  # each step asks every so many material points
+CHECKPOINT_SECONDS = 60.0  # of training between two checkpoints
+
+
+def compute_learning_rate(config: TrainConfig, step: int) -> float:
+    """Warm-up and cosine decay, or the reference's 0.9 every 250 steps."""
+    if config.schedule == "step":
+        return config.learning_rate * 0.9 ** (step // 250)
+    warm_up = max(1, config.steps // 20)
+    progress = (step - warm_up) / max(1, config.steps - warm_up)
+    return config.learning_rate * (min(1.0, (step + 1) / warm_up) * (0.01 + 0.99 * _cosine(max(0.0, progress))))
+
+
+def train_model(
+    config: TrainConfig, dataset: Path, folder: Path, *,
+    overwrite: bool = False, device: str = "", progress: bool = True, validate_every: int = 0,
+) -> Path:  # fmt: skip
+    """Train one model on the data set's training split; returns the path of its weights (safetensors).
+
+    The log (CSV) has a row a step; with ``validate_every`` steps, also the RMSE (px) on held-out simulations.
+
+    Under ``torchrun`` the processes share every step's groups (``config.groups`` must be a multiple of their number),
+    and the first one writes the files. The losses and gradients are those of a single process.
+
+    A finished model is returned as it is, a killed run goes on from its last checkpoint and ends with the same weights.
+    ``overwrite`` removes weights, checkpoint and log of the folder, nothing else.
+    On a CPU two runs on as many threads give the same weights to the last bit; on a GPU they do not.
+    Raises ValueError where the data set is of another object, does not store the symmetry group or has too few images,
+    and where ``config.trunk_weights`` are of another network; FileNotFoundError where there are none; LockedError while
+    another process trains in the folder.
+    """
+    overwrite, progress = read_flag("overwrite", overwrite), read_flag("progress", progress)
+    validate_every, folder = read_count("validate_every", validate_every), Path(folder)
+    weights = folder / WEIGHTS
+    if not overwrite and is_trained(weights, dataset, also=config.also):
+        return weights
+    parts = load_parts(dataset, "train", also=config.also)
+    if parts[0].object != config.object:
+        raise ValueError(f"object is {config.object!r}, but {dataset} shows a {parts[0].object}")
+    with distributed.joined(config.groups, device or find_device()) as team, held(folder, team), (
+        _repeatable(team.device)
+    ):  # fmt: skip
+        # by the process that held the folder before
+        if not overwrite and is_trained(weights, dataset, also=config.also):
+            return weights
+        run = _Run(config, parts, folder, team, validate_every)  # what is wrong is said before anything is deleted
+        if overwrite and team.rank == 0:
+            remove_run(folder)
+        team.wait()
+        run.resume()
+        shown = progress and team.rank == 0
+        bar = tqdm(range(run.step, config.steps), desc=config.name, disable=not shown, leave=False)
+        with saying_what_stays(run.describe_kept):
+            for _ in bar:
+                bar.set_postfix(loss=f"{run.advance():.3f}", refresh=False)
+            if team.rank == 0:
+                run.finish(weights)
+        team.wait()
+    return weights
+
+
+class _Run:
+    """A training run that can be killed between any two steps."""
+
+    def __init__(
+        self, config: TrainConfig, parts: list[Dataset], folder: Path, team: distributed.Team, validate_every: int = 0
+    ) -> None:
+        self.config, self.folder, self.team, self.validate_every = config, folder, team, validate_every
+        # the latter for calibration
+        self.data, self.held_out = (join_datasets(*split) for split in zip(*map(hold_out, parts), strict=True))
+        data = self.data
+        check_enough(data, self.held_out)
+        self.device, self.size = team.device, data.size
+        device = team.device
+        group = data.group(config.group)
+        known = group.permutations[:1] if config.method in MATCHES_OF_ONE else group.permutations
+        self.permutations = torch.tensor(known, device=device)
+        self.images = load_training_images(self.data, config.input_px)
+        torch.manual_seed(config.seed)
+        self.network = _make_network(config, folder.parent).to(device, memory_format=torch.channels_last)
+        # the average of the last steps' weights, statistics of batch normalisation included, is what is kept
+        average = get_ema_multi_avg_fn(1 - 1 / max(2.0, config.steps / 50))
+        self.average = AveragedModel(self.network, multi_avg_fn=average, use_buffers=True)
+        start = make_prototypes(self.data.xy, known, config.descriptor_dim, math.hypot(*data.size))
+        self.prototypes = torch.nn.Parameter(start.to(device))
+        self.trained = [p for p in self.network.parameters() if p.requires_grad]
+        self.optimisers = make_optimisers(self.network, [self.prototypes], config)
+        self.step, self.seconds, self.saved_at, self.saved_step, self.log = 0, 0.0, 0.0, 0, []
+
+    def advance(self) -> float:
+        """One optimiser step; saves a checkpoint every ``CHECKPOINT_SECONDS``."""
+        start = time.perf_counter()
+        self.network.train()
+        for optimiser in self.optimisers:
+            optimiser.param_groups[0]["lr"] = compute_learning_rate(self.config, self.step)
+            optimiser.zero_grad(set_to_none=True)
+        loss = self.team.add(sum(self.learn(group) for group in self.team.groups))
+        self.team.share_gradients([*self.trained, self.prototypes])
+        torch.nn.utils.clip_grad_norm_(self.trained, 5.0)
+        for optimiser in self.optimisers:
+            optimiser.step()
+        self.average.update_parameters(self.network)
+        self.step += 1
+        self.seconds += time.perf_counter() - start
+        self.log.append({"step": self.step, "loss": loss, "seconds": round(self.seconds, 2)})
+        if self.team.rank == 0:
+            self.keep()
+        return loss
+
+    def learn(self, group: int) -> float:
+        """Add the gradients of one group of the step's batch to the parameters'; returns its share of the loss."""
+        count, (seed, step, groups) = len(self.images.images), (self.config.seed, self.step, self.config.groups)
+        chosen = np.random.default_rng([seed, step]).choice(count, self.config.batch, count < self.config.batch)
+        own = np.array_split(chosen, groups)[group]
+        batch = make_batch(self.images, own, self.config, np.random.default_rng([seed, step, group]), self.device)
+        said = self.network.describe(batch.image.contiguous(memory_format=torch.channels_last))
+        loss = compute_loss(self.config, said.descriptors, batch, self.permutations, self.size, step, group)
+        if self.config.dense_weight:
+            loss = loss + self.config.dense_weight * self.compute_dense_loss(said.descriptors, batch)
+        if self.config.heads:
+            seeds = torch.Generator(self.device).manual_seed(-1 - (seed * 1_000_003 + step) * groups - group)
+            loss = loss + compute_head_loss(self.network.heads, said, batch, self.permutations, self.size, seeds)
+        (loss / groups).backward()
+        return loss.item() / groups
+
+    def keep(self) -> None:
+        """Validate and save a checkpoint where it is time."""
+        if self.validate_every and self.step % self.validate_every == 0:
+            self.log[-1]["rmse_px"] = round(self.validate(), 2)
+        if self.seconds - self.saved_at >= CHECKPOINT_SECONDS:
+            self.save()
+
+    def compute_dense_loss(self, descriptors: Tensor, batch: Batch) -> Tensor:
+        """The prototypes' loss, on a part of the material points in turn."""
+        turn = torch.arange(batch.askable.shape[1], device=self.device) % PROTOTYPE_EVERY
+        asked = batch.askable & (turn == self.step % PROTOTYPE_EVERY)
+        sampled = sample_descriptors(descriptors[:, : self.config.descriptor_dim], batch.xy, self.size)
+        return compute_prototype_loss(sampled, asked, self.prototypes, self.permutations)
+
+    def make_matcher(self) -> Matcher:
+        """A matcher of the averaged weights; of a contrastive loss, its bandwidth calibrated."""
+        modes = len(self.permutations)
+        matcher = Matcher(self.average.module, self.config, modes=modes, size=self.size, device=self.device.type)
+        if self.config.method in CONTRASTIVE:
+            calibrate_bandwidth(matcher, self.held_out)
+        return matcher
+
+    def validate(self) -> float:
+        """RMSE (px) on the held-out simulations."""
+        return measure_rmse(self.make_matcher(), self.held_out)
+
+    def save(self) -> None:
+        """Write a checkpoint whole or not at all."""
+        tensors = {"prototypes": self.prototypes.detach(), **self._list_weights()}
+        for number, optimiser in enumerate(self.optimisers):
+            for index, values in optimiser.state_dict()["state"].items():
+                tensors |= {f"optimisers/{number}/{index}/{name}": value for name, value in values.items()}
+        numbers = {"step": self.step, "seconds": self.seconds, "log": self.log}
+        write_checkpoint(self.folder / CHECKPOINT, tensors, self._describe_config(), numbers)
+        self.saved_at, self.saved_step = self.seconds, self.step
+
+    def describe_kept(self) -> str:
+        """What is on disk of a run that is stopped."""
+        kept = f"its checkpoint of step {self.saved_step} is kept in {self.folder}: call again without overwrite"
+        return f"training was stopped after step {self.step}; {kept if self.saved_step else 'nothing is kept yet'}"
+
+    def _list_weights(self) -> dict[str, Tensor]:
+        parts = {part: getattr(self, part).state_dict() for part in ("network", "average")}
+        return {f"{part}/{name}": value for part, values in parts.items() for name, value in values.items()}
+
+    def _read_checkpoint(self) -> tuple[dict[str, Tensor], dict[str, str]] | None:
+        """The folder's checkpoint, if there is one; the first process sets a damaged one aside before any goes on."""
+        path, found = self.folder / CHECKPOINT, None
+        like = {"prototypes": self.prototypes, **self._list_weights()}
+        if self.team.rank == 0 and path.is_file():
+            try:
+                found = read_checkpoint(path, like, str(self.device))
+            except DamagedFileError:
+                set_aside(path)
+        self.team.wait()
+        if self.team.rank and path.is_file():
+            found = read_checkpoint(path, like, str(self.device))
+        return found
+
+    def resume(self) -> None:
+        """Go on from the folder's checkpoint, if there is one; ValueError where it is of another configuration."""
+        found = self._read_checkpoint()
+        if found is None:
+            return
+        tensors, metadata = found
+        if metadata["config"] != self._describe_config():
+            path = self.folder / CHECKPOINT
+            raise ValueError(f"{path} belongs to another configuration: choose another folder or overwrite=True")
+        self.prototypes.data.copy_(tensors.pop("prototypes"))
+        parts = {"network": {}, "average": {}, "optimisers": {}}
+        for name, value in tensors.items():
+            part, rest = name.split("/", 1)
+            parts[part][rest] = value
+        self.network.load_state_dict(parts["network"])
+        self.average.load_state_dict(parts["average"])
+        states = [{} for _ in self.optimisers]
+        for name, value in parts["optimisers"].items():
+            number, index, field = name.split("/")
+            # the fused step takes for granted that moments lie in memory as their parameter does
+            like = self.optimisers[int(number)].param_groups[0]["params"][int(index)]
+            value = torch.empty_like(like).copy_(value) if value.ndim else value
+            states[int(number)].setdefault(int(index), {})[field] = value
+        for optimiser, state in zip(self.optimisers, states, strict=True):
+            optimiser.load_state_dict({**optimiser.state_dict(), "state": state})
+        numbers = json.loads(metadata["numbers"])
+        self.step, self.seconds, self.log = numbers["step"], numbers["seconds"], numbers["log"]
+        self.saved_at, self.saved_step = self.seconds, self.step
+
+    def _describe_config(self) -> str:
+        return json.dumps(dataclasses.asdict(self.config))
+
+    def finish(self, weights: Path) -> Path:
+        """Write log and weights, the weights last: a folder that has them is finished.
+
+        The trained weights are in a checkpoint before they are calibrated: what fails there costs no training.
+        """
+        if self.saved_step < self.step:
+            self.save()
+        write_text(self.folder / LOG, pd.DataFrame(self.log).to_csv(index=False))
+        metadata = {
+            "format": "mmgsd-1",
+            "config": json.dumps(dataclasses.asdict(self.config)),
+            "size": json.dumps(self.size),
+            "modes": str(len(self.permutations)),
+            "data": self.data.fingerprint,
+            "images": str(len(self.data)),
+            "seconds": f"{self.seconds:.1f}",
+            "hardware": _name_hardware(self.device),
+        }
+        matcher = self.make_matcher()
+        if matcher.bandwidth is not None:
+            metadata["bandwidth"] = repr(matcher.bandwidth)
+        metadata["temperature"] = repr(calibrate_temperature(matcher, self.held_out))
+        write_tensors(weights, self.average.module.state_dict(), metadata)
+        (self.folder / CHECKPOINT).unlink(missing_ok=True)
+        return weights
+
+
+@contextmanager
+def _repeatable(device: torch.device) -> Iterator[None]:
+    """Sums in the same order every time, on a CPU: a GPU has no such kernel for the gradient of sampling."""
+    before, filled = torch.are_deterministic_algorithms_enabled(), deterministic.fill_uninitialized_memory
+    torch.use_deterministic_algorithms(before or device.type == "cpu")
+    deterministic.fill_uninitialized_memory = False  # a seventh of a step went into memory that is overwritten at once
+    try:
+        yield
+    finally:
+        torch.use_deterministic_algorithms(before)
+        deterministic.fill_uninitialized_memory = filled
+
+
+def check_start(config: TrainConfig, models: Path) -> None:
+    """ValueError where ``config.trunk_weights`` do not fit the network, FileNotFoundError where there are none.
+
+    ``models`` is the folder that a model's name is looked for in, before data/weights.
+    """
+    _make_network(config, models)
+
+
+def _make_network(config: TrainConfig, models: Path) -> torch.nn.Module:
+    """The network as training starts from it; ``models`` is the folder of the models trained beside it."""
+    start, beside = config.trunk_weights, models / config.trunk_weights / WEIGHTS
+    start = str(beside) if start and beside.is_file() else start
+    parts = {"roles": config.roles, "heads": config.heads, "trunk_weights": start}
+    network = build_network(config.network, config.descriptor_dim, **parts)
+    if start and config.network in PASSES:  # of a model of ours; resnet34 has read torchvision's
+        trained = load(start, device="cpu")
+        for name in ("network", "descriptor_dim", "roles"):
+            theirs, asked = getattr(trained.config, name), getattr(config, name)
+            within = name == "network" and PASSES.get(theirs, math.inf) <= PASSES[asked] and theirs not in DETAILED
+            if theirs != asked and not within:
+                raise ValueError(f"trunk_weights {start!r} has {name} {theirs!r}, the training {asked!r}")
+        network.start_from(trained.network)
+    return network
+
+
+def _name_hardware(device: torch.device) -> str:
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    threads, cores = torch.get_num_threads(), os.cpu_count()
+    return f"CPU, {cores} cores" if threads >= cores else f"CPU, {threads} of {cores} cores"
+
+
+def _cosine(progress: float) -> float:
+    return 0.5 * (1 + math.cos(math.pi * min(1.0, progress)))

@@ -1,0 +1,1 @@
+"""Answering: from descriptors to all matches of a pixel."""

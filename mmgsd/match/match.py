@@ -1,0 +1,138 @@
+"""The answer to queries, the ``Match``, and what it offers; NumPy alone."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import cv2
+import numpy as np
+
+RADIUS_PX = 20.0  # within which a robot's grasp still holds, unless the caller says otherwise
+SHARED = ("image0", "image1")  # fields that all queries share; of every other one the first axis counts queries
+
+
+@dataclass(frozen=True)
+class Best:
+    """The one mode of each of S queries to act on; NaN where the answer is not sure enough."""
+
+    xy: np.ndarray  # (S, 2) px in image1
+    spread_px: np.ndarray  # (S,) std of the mode, root mean square over directions
+    confidence: np.ndarray  # (S,) in [0, 1]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Match:
+    """The answer to S queries; pixels are those of the caller's images.
+
+    ``len`` counts the queries; an index, negative ones too, a slice, an array of indices or a boolean mask takes some
+    of them, and a loop goes through them one by one: each gives a `Match`.
+    """
+
+    image0: np.ndarray  # (H0, W0, 3) uint8
+    image1: np.ndarray  # (H1, W1, 3) uint8
+    xy: np.ndarray  # (S, 2) px in image0
+    modes: np.ndarray  # (S, n, 2) px in image1, most probable first; NaN for absent ones
+    weights: np.ndarray  # (S, n), sum to 1 over the modes that are here, also where fewer were kept than fitted
+    covariances: np.ndarray  # (S, n, 2, 2) px²
+    entropy: np.ndarray  # (S,) nats, of the density over px
+    outside: np.ndarray  # (S,) heatmap mass outside the 95 % ellipses of all modes that were fitted, in [0, 1]
+    cells: np.ndarray  # (S, h, w) heatmap on the descriptors' grid, sums to 1
+    # None of what made the answer does not know it: weights that learnt no mask, hand-made descriptors
+    visible: np.ndarray | None = None  # (S, n) in [0, 1], whether each mode's match is seen there, or hidden
+    on_object: np.ndarray | None = None  # (S,) in [0, 1], whether the pixel asked about shows the object
+    absent: np.ndarray | None = None  # (S,) in [0, 1], whether image1 does not show the object at all
+
+    @cached_property
+    def heatmap(self) -> np.ndarray:
+        """(S, H1, W1) float32, the heatmaps over image1's pixels; each sums to 1. Of one: `compute_heatmap`."""
+        full = np.empty((len(self), *self.image1.shape[:2]), np.float32)
+        for index in range(len(self)):
+            full[index] = self.compute_heatmap(index)
+        return full
+
+    def compute_heatmap(self, index: int = 0) -> np.ndarray:
+        """(H1, W1) float32, the heatmap of one query over image1's pixels; sums to 1."""
+        size = (self.image1.shape[1], self.image1.shape[0])
+        pixels = cv2.resize(self.cells[index], size, interpolation=cv2.INTER_LINEAR)
+        return pixels / pixels.sum()
+
+    @property
+    def spread_px(self) -> np.ndarray:
+        """(S, n) std of each mode, root mean square over directions; NaN for absent modes."""
+        return np.sqrt(np.trace(self.covariances, axis1=-2, axis2=-1) / 2)
+
+    def confidence(self, *, radius_px: float = RADIUS_PX) -> np.ndarray:
+        """(S, n) in [0, 1], probability that a true match lies within ``radius_px`` of each mode.
+
+        That of a round Gaussian as wide as the mode, less what the mode's weight lacks of an equal share.
+        """
+        if not radius_px > 0:
+            raise ValueError(f"radius_px must be greater than 0 px, got {radius_px!r}")
+        present = (self.weights > 0).sum(1, keepdims=True)
+        near = -np.expm1(-0.5 * np.square(radius_px / self.spread_px))
+        return np.minimum(1, present * self.weights) * np.nan_to_num(near)
+
+    def best(self, *, min_confidence: float = 0.0, radius_px: float = RADIUS_PX) -> Best:
+        """The mode with the least spread of each query: which of the like places to grasp (paper introduction).
+
+        One that is seen is preferred to one that is hidden, where that is known. Abstains, with NaN for ``xy``, where a
+        true match lies within ``radius_px`` with less than ``min_confidence``, where the pixel asked about is more
+        likely background, and where the object is more likely not in image1.
+        """
+        if not 0 <= min_confidence <= 1:
+            raise ValueError(f"min_confidence must be in [0, 1], got {min_confidence!r}")
+        rows = np.arange(len(self.modes))
+        spread = np.nan_to_num(self.spread_px, nan=np.inf)
+        hidden = np.zeros(spread.shape, bool) if self.visible is None else self.visible < 0.5
+        chosen = np.lexsort((spread, hidden), axis=1)[:, 0]
+        confidence = self.confidence(radius_px=radius_px)[rows, chosen]
+        able = (confidence >= min_confidence) & self.answerable
+        xy = np.where(able[:, None], self.modes[rows, chosen], np.nan)
+        return Best(xy, self.spread_px[rows, chosen], confidence)
+
+    @property
+    def answerable(self) -> np.ndarray:
+        """(S,) bool, whether the pixel asked about and image1 both show the object, as far as that is known."""
+        able = np.ones(len(self), bool)
+        if self.on_object is not None:
+            able &= self.on_object >= 0.5
+        return able if self.absent is None else able & (self.absent <= 0.5)
+
+    def __len__(self) -> int:
+        return len(self.xy)
+
+    def __iter__(self) -> Iterator[Match]:
+        return (self[index] for index in range(len(self)))
+
+    def __getitem__(self, index: Any) -> Match:
+        """The answer to some queries alone; IndexError for one that there is not, or what is no index."""
+        if isinstance(index, bool | np.bool_) or index is None:
+            raise IndexError(f"index must be an integer, a slice, an array of indices or a mask, got {index!r}")
+        rows = np.atleast_1d(np.arange(len(self))[[] if np.size(index) == 0 and not _is_mask(index) else index])
+        if rows.ndim > 1:
+            raise IndexError(f"index must have one axis, got shape {np.shape(index)}")
+        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        asked = {name: value for name, value in fields.items() if name not in SHARED and value is not None}
+        return dataclasses.replace(self, **{name: value[rows] for name, value in asked.items()})
+
+    def __repr__(self) -> str:
+        sizes = (f"{image.shape[1]} x {image.shape[0]} px" for image in (self.image0, self.image1))
+        queries = "1 query" if len(self) == 1 else f"{len(self)} queries"
+        return f"Match({queries}, up to {self.modes.shape[1]} modes each, images of {' and '.join(sizes)})"
+
+    def plot(self, index: int = 0):  # noqa: ANN201 (matplotlib is imported only where a plot is asked for)
+        """Figure of source pixel, heatmap and modes with their 1-std ellipses, for one query.
+
+        ValueError where ``index`` is not in [0, S).
+        """
+        from mmgsd.figures.plots import plot_match
+
+        return plot_match(self, index)
+
+
+def _is_mask(index: Any) -> bool:
+    return np.asarray(index).dtype == bool

@@ -1,0 +1,284 @@
+"""From descriptors to heatmaps, their modes and entropy; the public ``Matcher`` and its answer, the ``Match``."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from mmgsd.config import CONTRASTIVE, ROUNDNESS, TrainConfig, find_root
+from mmgsd.images import check_aspect, check_mask, check_pixels, to_rgb
+from mmgsd.images import read_image as read_image
+from mmgsd.learn.heads import Outputs, look_up, weigh_cells
+from mmgsd.learn.losses import compute_squared_distances
+from mmgsd.learn.network import compute_cell_centres, find_device, fit_input_size, sample_descriptors
+from mmgsd.match.match import Best as Best
+from mmgsd.match.match import Match
+from mmgsd.match.mixture import Mixture, check_count, check_modes, fit_modes, keep_most_probable
+from mmgsd.match.weights import read_weights
+
+QUARTERS = 4  # turns of an image whose descriptors are averaged: what noise they have differs
+SIZES_PX = (16, 65536)  # of the images that a model was taught with
+
+
+def compute_heatmap(squared_distances: Tensor, *, bandwidth: float | None = None, temperature: float = 1.0) -> Tensor:
+    """Distributions over cells (..., C) from squared descriptor distances (..., C).
+
+    softmax(-d²) as in training (paper section "Symmetric Distributional Loss"); or, for descriptors of a contrastive
+    loss, which have no scale of their own, a Gaussian of ``bandwidth`` in the descriptor norm differences, normalised.
+    Either is raised to the power 1 / ``temperature``. ValueError where one of the two is not finite and above 0.
+    """
+    check_scales(bandwidth=bandwidth, temperature=temperature)
+    scale = 1.0 if bandwidth is None else 1 / (2 * bandwidth**2)
+    return torch.softmax(-scale / temperature * squared_distances, -1)
+
+
+def compute_entropy(heatmap: Tensor, cell_area: float) -> Tensor:
+    """Differential entropy in nats of the density over px: (S, C) to (S,); ln of the area it spreads over."""
+    return torch.special.entr(heatmap).sum(-1) + float(np.log(cell_area))
+
+
+def check_scales(*, bandwidth: float | None = None, temperature: float = 1.0) -> None:
+    """ValueError, which names it, for a ``bandwidth`` or a ``temperature`` that is not finite and greater than 0."""
+    for name, value in (("bandwidth", bandwidth), ("temperature", temperature)):
+        number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+        if value is not None and not (number and math.isfinite(value) and value > 0):
+            raise ValueError(f"{name} must be finite and greater than 0, got {value!r}")
+
+
+class Matcher:
+    """Finds all matches of pixels between two images of an object, with trained weights.
+
+    ``modes`` of its symmetry, and the ``size`` (width, height) px of the images it was taught with. ValueError for what
+    cannot be.
+    """
+
+    def __init__(
+        self, network: torch.nn.Module, config: TrainConfig, *, modes: int, size: tuple[int, int], device: str = "",
+        bandwidth: float | None = None, temperature: float = 1.0,
+    ) -> None:  # fmt: skip
+        check_scales(bandwidth=bandwidth, temperature=temperature)
+        check_modes(modes)
+        _check_size(size)
+        self.device = torch.device(device or find_device())
+        self.network = network.eval().to(self.device, memory_format=torch.channels_last)
+        self.config, self.modes, self.size = config, modes, size
+        self.object = config.object  # "" where a file of weights does not say
+        self.temperature = temperature
+        self.turns = QUARTERS if config.rotate else 1  # what was trained upright knows only upright images
+        self.bandwidth = config.margin / 4 if bandwidth is None and config.method in CONTRASTIVE else bandwidth
+
+    @classmethod
+    def load(cls, path: Path | str, *, device: str = "") -> Matcher:
+        """Weights from a safetensors file; FileNotFoundError, or ValueError for one that is damaged or not ours."""
+        weights = read_weights(path)
+        try:
+            matcher = cls(weights.network, weights.config, device=device, **weights.settings)
+        except ValueError as error:
+            raise ValueError(f"{path}: of its metadata, {error}: get the file anew") from error
+        matcher.object = weights.object
+        return matcher
+
+    @torch.inference_mode()
+    def describe(self, images: list[np.ndarray]) -> list[Outputs]:
+        """What the network says of each of the images (H, W, 3) uint8 of any sizes, the mean over quarter turns.
+
+        An `Outputs` each, without the batch's axis: ``descriptors`` (C, h, w), where C is D, or 2 D where an image is
+        described in both roles (as a source first, then as a target), and what the heads say where there are any. The
+        grid follows the image's own aspect (`fit_input_size`); images of one grid are described at once.
+        """
+        sizes = [self.compute_input_size(image) for image in images]
+        described = {}
+        for size in dict.fromkeys(sizes):
+            chosen = [index for index, other in enumerate(sizes) if other == size]
+            small = [cv2.resize(images[index], size, interpolation=cv2.INTER_AREA) for index in chosen]
+            batch = torch.from_numpy(np.stack(small)).to(self.device).permute(0, 3, 1, 2).float() / 255
+            described |= zip(chosen, self._say(batch).split(), strict=True)
+        return [described[index] for index in range(len(images))]
+
+    def compute_input_size(self, image: np.ndarray, name: str = "image") -> tuple[int, int]:
+        """(width, height) px that an image (H, W, 3) is given to the network with; ValueError for a narrow strip."""
+        size = (image.shape[1], image.shape[0])
+        if size[0] * self.size[1] != size[1] * self.size[0]:  # what the model was taught with may be a strip
+            check_aspect(size, name)
+        # px: where a level is less than 3 cells across, bfloat16's strided convolution on a CPU reads memory at random
+        least = 12 * self.network.stride
+        return fit_input_size(size, self.size, self.config.input_px, least_px=least)
+
+    def describe_inputs(self, batch: Tensor) -> Tensor:
+        """Descriptors (B, C, h, w) of images (B, 3, H, W) in [0, 1] of the network's input size."""
+        return self._say(batch).descriptors
+
+    def _say(self, batch: Tensor) -> Outputs:
+        """The mean of what the network says of images after each quarter turn, turned back."""
+        turns = (batch.rot90(k, (2, 3)).contiguous(memory_format=torch.channels_last) for k in range(self.turns))
+        said = [self.network.describe(turned).turn(-k) for k, turned in enumerate(turns)]
+        return Outputs.mean(said)
+
+    @torch.inference_mode()
+    def compute_heatmaps(
+        self, said0: Outputs, said1: Outputs, xy: Tensor, size: tuple[int, int], *, mask1: Tensor | None = None
+    ) -> Tensor:
+        """Heatmaps (S, h, w) of source px ``xy`` (S, 2) of an image of ``size``, from what `describe` made of each.
+
+        They are weighted by where the second image shows the object: by ``mask1`` (H1, W1) bool, or else by the
+        network's own mask, if it has one.
+        """
+        source = self._sample_sources(said0, xy, size)  # (1, S, D)
+        target = said1.descriptors[-self.config.descriptor_dim :]
+        squared = compute_squared_distances(source, target.flatten(1).T[None])[0]  # (S, h * w)
+        heatmap = compute_heatmap(squared, bandwidth=self.bandwidth, temperature=self.temperature)
+        heatmap = heatmap.view(len(xy), *target.shape[1:])
+        weight = weigh_cells(said1, target.shape[1:], mask1)
+        if weight is None:
+            return heatmap
+        weighted = heatmap * weight
+        total = weighted.sum((1, 2), keepdim=True)
+        return torch.where(total > 1e-12, weighted / total.clamp(min=1e-12), heatmap)
+
+    @torch.inference_mode()
+    def compute_visible(
+        self, said0: Outputs, said1: Outputs, xy: Tensor, modes: Tensor, sizes: tuple[tuple[int, int], ...]
+    ) -> Tensor | None:
+        """Probability (S, n) that what lies at ``xy`` (S, 2) px is seen at each of the ``modes`` (S, n, 2) px.
+
+        ``sizes`` are the two images' (width, height). 0 for modes that are NaN; None of a network without heads.
+        """
+        if said1.surface is None:
+            return None
+        there = torch.cat([said1.descriptors, said1.surface])[None]
+        places = modes.to(self.device).float().nan_to_num(-0.5)
+        there = sample_descriptors(there, places.flatten(0, 1)[None], sizes[1])[0].view(*modes.shape[:2], -1)
+        channels = len(said1.descriptors)
+        asked = self._sample_sources(said0, xy, sizes[0])[0][:, None]  # (S, 1, D)
+        logits = self.network.heads.judge(asked, there[..., :channels], there[..., channels:])
+        return torch.sigmoid(logits) * modes.isfinite().all(-1).to(logits.device)
+
+    def segment(self, image: Any) -> np.ndarray:
+        """Where an image shows the object: (H, W) float32 in [0, 1]; ValueError of weights that learnt no mask."""
+        image = to_rgb(image)
+        self.compute_input_size(image)
+        mask = self.describe([image])[0].mask
+        if mask is None:
+            raise ValueError(f"these weights of {self.config.name} learnt no mask: load others, like 'cloth' or 'rope'")
+        return cv2.resize(mask.sigmoid().cpu().numpy(), image.shape[1::-1], interpolation=cv2.INTER_LINEAR)
+
+    def _sample_sources(self, said0: Outputs, xy: Tensor, size: tuple[int, int]) -> Tensor:
+        sources = said0.descriptors[None, : self.config.descriptor_dim]
+        return sample_descriptors(sources, xy[None].to(self.device).float(), size)
+
+    def match(
+        self, image0: Any, image1: Any, xy: Any, *, n: Any = None, mask0: Any = None, mask1: Any = None
+    ) -> Match:
+        """All matches in ``image1`` of the pixels ``xy`` (S, 2), or of the one pixel (2,), of ``image0``.
+
+        Images are of any size and each of its own, and of any kind that `mmgsd.images.to_rgb` takes; they are copied.
+        ``n`` modes are returned, one number for all or (S,), by default as many as the symmetry group has members;
+        "auto" finds their number. The group's number is fitted even where fewer are asked for: of these the most
+        probable are the answer, and their weights are divided by their sum. ``mask0`` and ``mask1``, (H, W) bool each,
+        say where the images show the object, from any segmenter of yours: the network's own masks then do not count.
+        ValueError for other images or masks, for ``xy`` outside image0, or for ``n`` that is not from 1 to `MAX_MODES`.
+        """
+        return self.prepare(image0, image1, mask0=mask0, mask1=mask1).match(xy, n=n)
+
+    def prepare(self, image0: Any, image1: Any, *, mask0: Any = None, mask1: Any = None) -> Pair:
+        """Describe two images once, to ask about them many times; arguments and errors are those of `match`."""
+        images = {name: to_rgb(image, name) for name, image in (("image0", image0), ("image1", image1))}
+        for name, image in images.items():
+            self.compute_input_size(image, name)
+        masks = {"mask0": mask0, "mask1": mask1}
+        for (name, mask), image in zip(masks.items(), images.values(), strict=True):
+            masks[name] = None if mask is None else check_mask(mask, image.shape[:2], name)
+        return Pair(self, *images.values(), tuple(self.describe(list(images.values()))), **masks)
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """Two images and what the network says of them: each question takes a few milliseconds."""
+
+    matcher: Matcher
+    image0: np.ndarray  # (H0, W0, 3) uint8
+    image1: np.ndarray  # (H1, W1, 3) uint8
+    said: tuple[Outputs, Outputs]
+    mask0: np.ndarray | None = None  # (H0, W0) bool, of the caller's
+    mask1: np.ndarray | None = None  # (H1, W1) bool
+
+    @torch.inference_mode()
+    def match(self, xy: Any, *, n: Any = None) -> Match:
+        """As `Matcher.match`."""
+        size0, size1 = sizes = tuple((im.shape[1], im.shape[0]) for im in (self.image0, self.image1))
+        points = check_pixels(xy, size0)
+        mask1 = None if self.mask1 is None else torch.from_numpy(self.mask1)
+        cells = self.matcher.compute_heatmaps(*self.said, torch.from_numpy(points), size0, mask1=mask1)
+        centres = compute_cell_centres(size1, cells.shape[-2:])
+        fitted, roundness = self.matcher.modes, self.matcher.config.roundness
+        match = make_match(self.image0, self.image1, points, cells, centres, n, fitted=fitted, roundness=roundness)
+        return dataclasses.replace(match, **self._look(match, sizes))
+
+    def _look(self, match: Match, sizes: tuple[tuple[int, int], ...]) -> dict[str, np.ndarray]:
+        """What is known of the object's presence: ``visible``, ``on_object`` and ``absent`` of a match."""
+        known, xy = {}, torch.from_numpy(match.xy)
+        visible = self.matcher.compute_visible(*self.said, xy, torch.from_numpy(match.modes), sizes)
+        if visible is not None:
+            known["visible"] = visible.cpu().numpy()
+        on_object = look_up(self.mask0, self.said[0].mask, match.xy, sizes[0])
+        if on_object is not None:
+            known["on_object"] = on_object
+        if self.mask1 is not None or self.said[1].present is not None:
+            absent = 0.0 if self.mask1 is not None else float(1 - self.said[1].present.sigmoid())
+            known["absent"] = np.full(len(match), absent, np.float32)
+        return known
+
+
+def load(weights: Path | str, *, device: str = "") -> Matcher:
+    """A `Matcher` with the weights of a file, or of a name that ``data/weights`` holds: ``"cloth"``, ``"rope-spcl"``.
+
+    FileNotFoundError where there are none; ValueError for a file that is damaged or not ours.
+    """
+    if not Path(weights).exists():
+        folder = find_root() / "data" / "weights"
+        names = sorted(path.stem for path in folder.glob("*.safetensors"))
+        if str(weights) not in names:
+            raise FileNotFoundError(f"{weights} must be a safetensors file or one of {', '.join(map(repr, names))}")
+        weights = folder / f"{weights}.safetensors"
+    return Matcher.load(weights, device=device)
+
+
+def make_match(
+    image0: np.ndarray, image1: np.ndarray, xy: np.ndarray, cells: Tensor, centres: tuple[Tensor, Tensor], n: Any, *,
+    fitted: int = 1, roundness: float = ROUNDNESS,
+) -> Match:  # fmt: skip
+    """The answer that heatmaps (S, h, w) with cell ``centres`` (w,), (h,) px hold, however they were made.
+
+    At least ``fitted`` modes are fitted, of which the ``n`` most probable are returned; None: as many.
+    """
+    wanted = check_count(fitted if n is None else n, "n", queries=len(cells))
+    fit, entropy = read_heatmap(cells, "auto" if wanted is None else wanted.clamp(min=fitted), centres,
+                                roundness=roundness)  # fmt: skip
+    fit = fit if wanted is None else keep_most_probable(fit, wanted)
+    arrays = (t.cpu().numpy() for t in (fit.modes, fit.weights, fit.covariances, entropy, fit.outside, cells))
+    return Match(image0, image1, xy, *arrays)
+
+
+def read_heatmap(
+    heatmap: Tensor, n: int | str | Tensor, centres: tuple[Tensor, Tensor], *, roundness: float = ROUNDNESS
+) -> tuple[Mixture, Tensor]:
+    """Mixtures of ``n`` modes and entropies (S,) in nats of heatmaps (S, h, w) with cell ``centres`` (w,), (h,) px."""
+    xs, ys = (c.float().to(heatmap.device) for c in centres)
+    entropy = compute_entropy(heatmap.flatten(1), float((xs[1] - xs[0]) * (ys[1] - ys[0])))
+    return fit_modes(heatmap, n, xs, ys, roundness=roundness), entropy
+
+
+def _check_size(size: tuple[int, int]) -> None:
+    """ValueError unless two whole numbers of px."""
+    low, high = SIZES_PX
+    whole = isinstance(size, tuple | list) and len(size) == 2 and all(type(side) is int for side in size)
+    if not whole or not all(low <= side <= high for side in size):
+        raise ValueError(f"size must be (width, height), two whole numbers of {low} to {high} px, got {size!r:.80}")

@@ -1,0 +1,230 @@
+"""All models of a preset and its baselines as independent tasks, the most important first: here, or on a Dask cluster.
+
+    python -m mmgsd.measure.matrix paper                              trains and asks each model; a killed call goes on
+    python -m mmgsd.measure.matrix paper --only cloth-spcl            those whose name holds that text
+    python -m mmgsd.measure.matrix paper --scheduler tcp://host:8786  each worker one model at a time, on its own GPU
+    python -m mmgsd.measure.matrix quick --seeds 3                    instead the four methods, each with three seeds
+
+Notebooks find the models and their tables of answers where they would have put them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+from dask.distributed import Client, as_completed
+from tqdm.auto import tqdm
+
+from mmgsd.command import run_command
+from mmgsd.config import METHODS, OBJECTS, OWN_STEPS, Paths, Preset, TrainConfig, find_root, load_preset, read_count
+from mmgsd.files import DamagedFileError
+from mmgsd.learn.checkpoints import WEIGHTS, describe_run
+from mmgsd.learn.training import train_model
+from mmgsd.measure.evaluation import (
+    BASELINES,
+    CHANCE,
+    evaluate_baseline,
+    evaluate_model,
+    load_queries,
+    read_results,
+    summarise,
+    write_results,
+)
+from mmgsd.parameters import read_scheduler
+
+FIRST = ("mmgsd", "spcl")  # before the studies
+LATER = ("unimodal", "pcl", "spcl_dense", "mmgsd_plain", "mmgsd_deep", "spcl_deep")  # and after
+GROUPS = ("c4", "v4", "d4")
+VALIDATIONS = 8  # RMSE on held-out simulations, in a model's log
+
+Task = TrainConfig | tuple[str, str]  # a model to train and ask, or an object and a baseline to ask
+
+
+def list_models(preset: Preset) -> list[TrainConfig]:
+    """MMGSD and SPCL, the studies' models (symmetry, methods, σ), and the rest of the main table."""
+    main, last = {name: preset.main_table(name) for name in OBJECTS}, (*LATER, *OWN_STEPS)
+    first, later = ([main[name][method] for method in methods for name in OBJECTS] for methods in (FIRST, last))
+    budget = [preset.budget_table(name)[m] for m in (*FIRST, *LATER) for name in OBJECTS]
+    groups = [dataclasses.replace(preset.ablation["cloth"], group=group) for group in GROUPS]
+    sigmas = [preset.sigma_table(name)[sigma] for sigma in preset.sigma_table("cloth") for name in OBJECTS]
+    return list(dict.fromkeys([*first, *groups, *budget, *sigmas, *later]))
+
+
+def list_repeats(preset: Preset, seeds: int, *, steps: int = 0) -> list[TrainConfig]:
+    """The four methods of the main table, of other ``steps`` than its where they are not 0: all with seed 0, then 1…"""
+    keyed = {object: preset.seed_table(object, range(seeds), steps=steps) for object in OBJECTS}
+    order = METHODS[::-1]  # MMGSD first
+    return [keyed[object][f"{m}-{seed}"] for seed in range(seeds) for m in order for object in OBJECTS]
+
+
+def list_tasks(preset: Preset) -> list[Task]:
+    """MMGSD and SPCL, then chance and the hand-made descriptors, then the other models (`list_models`)."""
+    models, count = list_models(preset), len(FIRST) * len(OBJECTS)
+    return [*models[:count], *((name, method) for method in (*CHANCE, *BASELINES) for name in OBJECTS), *models[count:]]
+
+
+def name_task(task: Task) -> str:
+    """What a model's folder is called, or "cloth-sift"."""
+    return task.name if isinstance(task, TrainConfig) else "-".join(task)
+
+
+def run_task(
+    task: Task, preset: Preset, root: Path, after: tuple[str, float] | None = None, *, progress: bool = False
+) -> tuple[str, float]:
+    """Train a model and ask it the preset's questions, or ask a baseline, unless that is done; name and RMSE (px).
+
+    Models of the preset that it starts from are trained first; ``after`` is the last one's result, to be waited for.
+    """
+    paths, name = Paths(root, preset.name), name_task(task)
+    if isinstance(task, TrainConfig):
+        data = paths.dataset(task.object)
+        for model in (*_find_start(task, preset), task):
+            every = max(1, model.steps // VALIDATIONS)
+            weights = train_model(model, data, paths.model(model), progress=progress, validate_every=every)
+        how = {"group": task.group, "progress": progress}
+        out = evaluate_model(weights, data, preset.evaluate, paths.queries(name), **how)
+    else:
+        data, out = paths.dataset(task[0]), paths.queries(name)
+        evaluate_baseline(task[1], data, preset.evaluate, out, progress=progress)
+    queries = load_queries(out)
+    return name, float(queries.rmse_px[queries.visible].mean())
+
+
+def _find_start(task: Task, preset: Preset) -> list[TrainConfig]:
+    """The models of the preset that a task starts from, if it does: each from the one before it."""
+    start = task.trunk_weights if isinstance(task, TrainConfig) else ""
+    found = [model for model in list_models(preset) if model.name == start]
+    return [*_find_start(found[0], preset), *found] if found else []
+
+
+def run_tasks(tasks: list[Task], preset: Preset, root: Path, *, scheduler: str = "") -> Iterator[tuple]:
+    """`run_task` of each, as they are done; on the workers of the Dask cluster at ``scheduler`` if one is given.
+
+    These need the same folder ``root``, and one thread each: a worker trains one model at a time.
+    """
+    if not scheduler:
+        yield from (run_task(task, preset, root, progress=True) for task in tasks)
+        return
+    with Client(scheduler) as client:
+        futures = {}
+        for i, task in enumerate(tasks):
+            after = next((futures.get(start.name) for start in reversed(_find_start(task, preset))), None)
+            futures[name_task(task)] = client.submit(run_task, task, preset, root, after, pure=False, priority=-i)
+        yield from (future.result() for future in as_completed(futures.values()))
+
+
+def write_tables(preset: Preset, root: Path) -> None:
+    """Write what is trained and asked so far: the main table, that of the equal budget, and that of σ.
+
+    Where the answers are not here, given on another machine, the row that is there is kept if it is of the same model.
+    """
+    write_main_table(preset, root)
+    _write_study({name: preset.budget_table(name) for name in OBJECTS}, Paths(root, preset.name), "budget")
+    write_sigma_table(preset, root)
+
+
+def write_main_table(preset: Preset, root: Path) -> dict[str, dict[str, dict]]:
+    """Write rmse.json and runs.json, by the rule of `write_tables`; returns the former, {object: {method: row}}."""
+    paths = Paths(root, preset.name)
+    errors, costs = (read_results(paths.results / f"{name}.json", depth=n) for name, n in (("rmse", 2), ("runs", 1)))
+    tables, runs = {name: {} for name in OBJECTS}, {}
+    for name in OBJECTS:
+        models = preset.main_table(name)
+        for method in (*models, *BASELINES, *CHANCE):
+            key, stored = f"{name}-{method}", errors.get(name, {}).get(method, {})
+            row, run = _find_row(paths, key, models.get(method), stored, costs.get(key, {}))
+            tables[name] |= {method: row} if row else {}
+            runs |= {key: run} if run else {}
+    write_results(runs, paths.results / "runs.json")
+    write_results(tables, paths.results / "rmse.json")
+    return tables
+
+
+def write_sigma_table(preset: Preset, root: Path, sigmas_px: Sequence[float] = (), *, steps: int = 0) -> None:
+    """Write sigma.json, by the rule of `write_tables`; ``sigmas_px`` besides the preset's and those that are there.
+
+    The models of other ``steps`` than the smaller budget's have a file of their own: sigma_4000.json.
+    """
+    steps = read_count("steps", steps)
+    paths, study = Paths(root, preset.name), f"sigma_{steps}" if steps else "sigma"
+    there = _read_keys(paths.results / f"{study}.json", float)
+    chosen = [*preset.sigmas_px, *sigmas_px, *there]
+    _write_study({name: preset.sigma_table(name, chosen, steps=steps) for name in OBJECTS}, paths, study)
+
+
+def write_seed_table(preset: Preset, root: Path, seeds: int = 0, *, steps: int = 0) -> None:
+    """Write seeds.json, by the rule of `write_tables`: of the seeds 0 to ``seeds`` - 1, and those that are there.
+
+    The models of other ``steps`` than the main table's have a file of their own: seeds_1000.json.
+    """
+    seeds, steps = read_count("seeds", seeds), read_count("steps", steps)
+    paths, study = Paths(root, preset.name), f"seeds_{steps}" if steps else "seeds"
+    there = _read_keys(paths.results / f"{study}.json", lambda key: int(key.rpartition("-")[2]))
+    chosen = [*range(seeds), *there]
+    _write_study({name: preset.seed_table(name, chosen, steps=steps) for name in OBJECTS}, paths, study)
+
+
+def _read_keys(path: Path, convert: Callable[[str], float]) -> list[float]:
+    """The numbers that a study's rows are called by; DamagedFileError where one is none."""
+    try:
+        return [convert(key) for rows in read_results(path, depth=2).values() for key in rows]
+    except ValueError as error:
+        if isinstance(error, DamagedFileError):
+            raise
+        raise DamagedFileError(f"{path} has a row of another study ({error}): restore it, or remove the row") from error
+
+
+def _write_study(models: dict[str, dict[str, TrainConfig]], paths: Paths, study: str) -> None:
+    """One file {object: {key: errors, and under "run" the cost}} of models under the same keys, where any is done."""
+    stored, rows = read_results(paths.results / f"{study}.json", depth=2), {}
+    for name, keyed in models.items():
+        for key, model in keyed.items():
+            kept = stored.get(name, {}).get(key, {})
+            row, run = _find_row(paths, "", model, kept, kept.get("run", {}))
+            if row:
+                rows.setdefault(name, {})[key] = {**row, "run": run}
+    if rows or stored:
+        write_results(rows, paths.results / f"{study}.json")
+
+
+def _find_row(paths: Paths, key: str, model: TrainConfig | None, row: dict, run: dict) -> tuple[dict, dict]:
+    """Results and cost of a model, or of the baseline ``key``: those of its answers, or else what is stored."""
+    out = paths.queries(model.name if model else key)
+    if out.is_file():
+        return summarise({key: out})[key], describe_run(paths.model(model) / WEIGHTS) if model else {}
+    return (row, run) if model is None or run.get("model") == model.name else ({}, {})
+
+
+def main() -> None:
+    """Run the models and baselines of a preset, a line each."""
+    parser = argparse.ArgumentParser(prog="python -m mmgsd.measure.matrix", description=__doc__.split("\n")[0])
+    parser.add_argument("preset")
+    parser.add_argument("--only", default="", help="those whose name holds this text, like cloth or cloth-spcl")
+    parser.add_argument("--seeds", type=int, default=0, help="instead the four methods, each with so many seeds")
+    parser.add_argument("--steps", type=int, default=0, help="of those (default: the main table's)")
+    parser.add_argument("--scheduler", default="", help="address of a Dask scheduler; none: this process")
+    asked = parser.parse_args()
+    if asked.seeds < 0 or asked.steps < 0 or (asked.steps and not asked.seeds):
+        parser.error("--seeds and --steps must be positive, and --steps needs --seeds")
+    preset = load_preset(asked.preset)
+    tasks = list_repeats(preset, asked.seeds, steps=asked.steps) if asked.seeds else list_tasks(preset)
+    tasks = [task for task in tasks if asked.only in name_task(task)]
+    if not tasks:
+        parser.error(f"--only {asked.only!r}: no model or baseline of the preset {preset.name} has a name with that")
+    scheduler = read_scheduler("--scheduler", asked.scheduler)
+    done = run_tasks(tasks, preset, find_root(), scheduler=scheduler)
+    for name, rmse in tqdm(done, total=len(tasks), desc="models and baselines"):
+        tqdm.write(f"{name}: {rmse:.1f} px")
+        if asked.seeds:
+            write_seed_table(preset, find_root(), asked.seeds, steps=asked.steps)
+        else:
+            write_tables(preset, find_root())
+
+
+if __name__ == "__main__":
+    run_command(
+        main, kept="finished models and answers are kept, and the same command goes on from the last checkpoint"
+    )

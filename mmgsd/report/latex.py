@@ -1,0 +1,113 @@
+"""The replication report's numbers, tables and verdicts, made from a preset's results: LaTeX for paper/report.tex.
+
+    python -m mmgsd.report.latex quick        data/results/quick -> paper/generated/results.tex, main_table.tex, …
+
+A stage that was not run for the preset leaves no results file: its table then says so, and the report still builds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mmgsd.command import run_command
+from mmgsd.config import IMAGE_SIZE, N_POINTS, OBJECTS, Paths, find_root, load_preset
+from mmgsd.files import write_text
+from mmgsd.report import latex_tables as tables
+from mmgsd.report.claims import list_claims
+from mmgsd.report.tables import read_table, told_where
+
+FILES = ("rmse", "runs", "budget", "sigma", "uncertainty", "symmetry", "broken_symmetry", "errors", "seeds_1000")
+ENDS = 0.1  # of a rope's length at each end, its extremities; the middle is the fifth around its centre
+
+Results = Mapping[str, Any]
+
+
+def write_report(preset: str, root: Path) -> list[Path]:
+    """Write everything that the report inputs into ``paper/generated``; ValueError for an unknown preset.
+
+    DamagedFileError, which names the file or the folder, where a number is missing or is none.
+    """
+    config, paths = load_preset(preset), Paths(root, preset)
+    results = load_results(paths.results)
+    with told_where(paths.results):
+        claims = list_claims(results)
+        described = dataclasses.asdict(config) | {"image_size": IMAGE_SIZE}
+        numbers = {**results, "config": described, "verdict": {claim.key: claim.verdict for claim in claims}}
+        texts = {"results": make_definitions(preset, numbers), "claims_table": tables.make_claims_table(claims)}
+    for name, (file, make) in tables.TABLES.items():
+        with told_where(paths.results / f"{file}.json"):
+            texts[name] = make(results[file]) if file in results else tables.NOT_RUN
+    return [write_text(root / "paper" / "generated" / f"{name}.tex", f"{text}\n") for name, text in texts.items()]
+
+
+def load_results(folder: Path) -> dict[str, Any]:
+    """{name: content} of the results files that are there, and ``places`` where the figures' data are."""
+    files = {name: folder / f"{name}.json" for name in FILES}
+    results = {name: read_table(path) for name, path in files.items() if path.is_file()}
+    drawn = {name: folder / f"figures_{name}.safetensors" for name in OBJECTS}
+    places = {name: measure_places(path, name) for name, path in drawn.items() if path.is_file()}
+    return results | ({"places": places} if places else {})
+
+
+def measure_places(path: Path, name: str) -> dict[str, float]:
+    """MMGSD's mean error (px) by place on the object: ``corner``, ``edge``, ``interior``, or ``end``, ``middle``."""
+    from mmgsd.figures.symmetry import find_regions
+    from mmgsd.measure.figure_data import load_figure_data  # with torch: only where it is needed
+
+    errors = load_figure_data(path).errors["mmgsd"]
+    if name == "cloth":
+        places = find_regions()
+    else:
+        from_middle = np.abs(np.arange(N_POINTS) / (N_POINTS - 1) - 0.5)
+        places = {"end": from_middle > 0.5 - ENDS, "middle": from_middle < ENDS}
+    mean, asked = np.nan_to_num(errors.mean_px), errors.asked
+    return {place: float(np.average(mean[p], weights=asked[p])) for place, p in places.items() if asked[p].any()}
+
+
+def flatten(tree: Mapping[str, Any] | Sequence[Any], prefix: str = "") -> dict[str, str]:
+    """{"file/key/.../metric": value as LaTeX} of nested results; what is None is left out.
+
+    Keys keep letters, digits, ``@``, ``_`` and points, all else is a hyphen: "cloth, ±45° only" is "cloth-45-only".
+    Raises ValueError where two keys become one.
+    """
+    flat: dict[str, str] = {}
+    for key, value in _walk(tree, prefix):
+        if key in flat:
+            raise ValueError(f"two results have the one name {key!r}")
+        flat[key] = value
+    return flat
+
+
+def _walk(tree: Any, prefix: str) -> Iterator[tuple[str, str]]:
+    if isinstance(tree, Mapping | list | tuple):
+        pairs = tree.items() if isinstance(tree, Mapping) else enumerate(tree)
+        for key, value in pairs:
+            name = re.sub(r"[^A-Za-z0-9@._]+", "-", str(key)).strip("-")
+            yield from _walk(value, f"{prefix}/{name}" if prefix else name)
+    elif tree is not None:
+        yield prefix, tables.escape(tree) if isinstance(tree, str) else str(tree).lower()
+
+
+def make_definitions(preset: str, numbers: Results) -> str:
+    r"""``\preset``, and a ``\defresult{key}{value}`` for every number."""
+    lines = [rf"\defresult{{{key}}}{{{value}}}" for key, value in flatten(numbers).items()]
+    return "\n".join([rf"\newcommand{{\preset}}{{{tables.escape(preset)}}}", *lines])
+
+
+def main() -> None:
+    """Write the numbers and tables of one preset."""
+    parser = argparse.ArgumentParser(prog="python -m mmgsd.report.latex", description=__doc__.split("\n")[0])
+    parser.add_argument("preset")
+    for path in write_report(parser.parse_args().preset, find_root()):
+        print(path)
+
+
+if __name__ == "__main__":
+    run_command(main)

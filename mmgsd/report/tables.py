@@ -1,0 +1,204 @@
+"""The tables of Markdown files, made from the results: ``python -m mmgsd.report.tables data/results README.md``."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import statistics
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from mmgsd.command import run_command
+from mmgsd.config import LONGER
+from mmgsd.files import DamagedFileError, read_json, write_text
+
+REMEDY = "restore it (it may be in git), or run its notebook again"
+
+PAPER = {"cloth": 32.4, "rope": 31.3}  # px, MMGSD's RMSE as the paper reports it
+LABELS = {
+    "mmgsd": "**MMGSD** (ours)", "mmgsd_deep": "MMGSD, deeper network", "mmgsd_long": f"MMGSD, {LONGER} × the steps",
+    "mmgsd_fine": "MMGSD, then larger images", "mmgsd_fine_deep": "MMGSD, then deeper network",
+    "mmgsd_muon": "MMGSD, Muon, detail branch",
+    "mmgsd_plain": "MMGSD, own loss alone",
+    "spcl_deep": "SPCL, dense, deeper network", "spcl_dense": "SPCL, dense supervision", "spcl": "SPCL",
+    "spcl_reference": "SPCL, reference setting",
+    "unimodal": "Unimodal", "pcl": "PCL",
+    "sift": "SIFT", "orb": "ORB", "akaze": "AKAZE", "daisy": "DAISY", "surf": "SURF",
+    "random": "random points", "centre": "object's centre",
+}  # fmt: skip
+GROUPS = {"v4": "`v4`, the flips", "c4": "`c4`, the rotations", "d4": "`d4`, all eight"}
+
+Errors = dict[str, dict[str, dict[str, float]]]  # {object: {method, or σ: {metric: value}}}
+
+
+def make_results_table(results: Errors, *, paper: bool = True) -> str:
+    """Markdown of RMSE, median and pck of both objects, a method a row; ``paper`` adds the paper's own errors."""
+    lines = _make_lines("", results, LABELS)
+    if paper:
+        theirs = [f"*{PAPER[object]}* | – | –" for object in PAPER]
+        lines.append(f"| *the paper's MMGSD, 3,500 images each* | {' | '.join(theirs)} |")
+    return "\n".join(lines)
+
+
+def make_budget_table(results: Errors) -> str:
+    """`make_results_table` without the paper's errors, which are not of this smaller budget."""
+    return make_results_table(results, paper=False)
+
+
+def make_sigma_table(results: Errors) -> str:
+    """The same measures of MMGSD by the std of its targets."""
+    sigmas = sorted({sigma for rows in results.values() for sigma in rows}, key=float)
+    return "\n".join(_make_lines("σ px", results, {sigma: sigma for sigma in sigmas}))
+
+
+def make_seed_table(results: Errors) -> str:
+    """Markdown of the mean and the std of the RMSE over seeds, from {object: {"mmgsd-0": errors}}, a method a row."""
+    lines = ["| RMSE px: mean ± std (seeds) | cloth | rope |", "|---|---|---|"]
+    for method, label in LABELS.items():
+        errors = [_collect_seeds(results.get(object, {}), method) for object in PAPER]
+        if any(errors):
+            lines.append(f"| {label} | {' | '.join(_format_seeds(values) for values in errors)} |")
+    return "\n".join(lines)
+
+
+def _collect_seeds(rows: dict[str, dict[str, float]], method: str) -> list[float]:
+    """The method's RMSE (px) with each seed, of {"mmgsd-0": errors, "mmgsd-1": …}."""
+    return [row["rmse_mean"] for key, row in rows.items() if key.rpartition("-")[0] == method]
+
+
+def _format_seeds(values: list[float]) -> str:
+    """Mean, std of the sample, and how many: "54.6 ± 0.8 (3)"; no std of fewer than two."""
+    if len(values) < 2:
+        return f"{values[0]:.1f} (1)" if values else "–"
+    return f"{statistics.mean(values):.1f} ± {statistics.stdev(values):.1f} ({len(values)})"
+
+
+def make_symmetry_table(results: dict[str, dict[str, Any]]) -> str:
+    """Markdown from {group: errors, and under "regions" those by place}, a group a row."""
+    lines = ["| taught and asked | all | corners | edges | interior |", "|---|---|---|---|---|"]
+    for group, row in results.items():
+        errors = [row["rmse_mean"], *(row["regions"][region]["rmse_px"] for region in ("corner", "edge", "interior"))]
+        lines.append(f"| {GROUPS.get(group, f'`{group}`')} | {' | '.join(f'{error:.1f}' for error in errors)} |")
+    return "\n".join(lines)
+
+
+def make_fixes_table(results: dict[str, dict[str, float]]) -> str:
+    """Markdown of PCL's errors with and without the ways to break the symmetry: {images: errors}, a row each."""
+    lines = ["| images | RMSE px | median px | pck@20px | nearest match px | the right one |", "|---" * 6 + "|"]
+    for images, row in results.items():
+        lines.append(f"| {images} | {_format_errors(row)} | {row['nearest_of_all']:.1f} | {100 * row['right']:.0f} % |")
+    return "\n".join(lines)
+
+
+def _make_lines(first: str, results: Errors, labels: dict[str, str]) -> list[str]:
+    """A heading, and a row for each label whose key is in the results; a dash stands for what has not been run."""
+    measures = "RMSE px | median px | pck@20px"
+    heads = [f"{object}: {measures}" for object in PAPER]
+    lines = [f"| {first}".rstrip() + f" | {' | '.join(heads)} |", "|---" * 7 + "|"]
+    for key, label in labels.items():
+        rows = [results.get(object, {}).get(key) for object in PAPER]
+        if any(rows):  # SURF is not in every OpenCV
+            cells = [_format_errors(row) if row else "– | – | –" for row in rows]
+            lines.append(f"| {label} | {' | '.join(cells)} |")
+    return lines
+
+
+def _format_errors(row: dict[str, float]) -> str:
+    return f"{row['rmse_mean']:.1f} | {row['median']:.1f} | {100 * row['pck@20px']:.0f} %"
+
+
+def make_uncertainty_table(results: dict[str, dict[str, dict[str, dict[str, float | None]]]]) -> str:
+    """Markdown from {"calibrated" or "temperature 1": {object: {method: {measure: value}}}}, a method a row."""
+    lines = [
+        "| | | Spearman | AURC px | 90 % ellipses hold | ECE | AUROC occluded |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for name, methods in results["calibrated"].items():
+        for method, label in LABELS.items():
+            if method in methods:
+                before = results["temperature 1"][name].get(method)
+                lines.append(f"| {name} | {label} | {_format_uncertainty(methods[method], before)} |")
+    return "\n".join(lines)
+
+
+def _format_uncertainty(after: dict[str, float | None], before: dict[str, float | None] | None) -> str:
+    def change(key: str, scale: float, form: str) -> str:
+        values = [after[key]] if before is None else [before[key], after[key]]
+        return " → ".join("–" if v is None else format(scale * v, form) for v in values)
+
+    measures = [f"{after['spearman']:.2f}", f"{after['aurc']:.1f} of {after['aurc_random']:.1f}"]
+    measures += [change("coverage@90%", 100, ".0f") + " %", change("ece", 1, ".2f")]
+    return " | ".join([*measures, "–" if after["auroc_occluded"] is None else f"{after['auroc_occluded']:.2f}"])
+
+
+def update_tables(document: Path, results: Path) -> None:
+    """Make every marked table of a Markdown file anew from the folder of results.
+
+    Raises ValueError where the file marks no table, or one that `TABLES` does not have, DamagedFileError where a
+    results file is damaged.
+    """
+
+    def fill(marked: re.Match[str]) -> str:
+        if marked["name"] not in TABLES:
+            raise ValueError(f"{document} marks a table {marked['name']!r}, accepted are {', '.join(TABLES)}")
+        file, make = TABLES[marked["name"]]
+        values = read_table(results / file)
+        with told_where(results / file):
+            return marked["begin"] + make(values) + marked["end"]
+
+    text, tables = MARKED.subn(fill, document.read_text())
+    if not tables or text.count("made by `make readme`") != tables:
+        raise ValueError(f"{document} must hold at least one table, each between {BEGIN!r} and {END!r}")
+    write_text(document, text)
+
+
+def read_table(path: Path) -> dict[str, Any]:
+    """The content of a results file; FileNotFoundError, or DamagedFileError where it is no dictionary."""
+    values = read_json(path, remedy=REMEDY)
+    if not isinstance(values, dict):
+        raise DamagedFileError(f"{path} holds no table of results: {REMEDY}")
+    return values
+
+
+@contextmanager
+def told_where(path: Path) -> Iterator[None]:
+    """Name the file in which a number is missing, or is none."""
+    try:
+        yield
+    except (LookupError, TypeError, AttributeError) as error:
+        raise DamagedFileError(f"{path} lacks a number, or has one that is none ({error!r}): {REMEDY}") from error
+
+
+BEGIN, END = "<!-- NAME: made by `make readme` -->", "<!-- end of NAME -->"
+MARKED = re.compile(
+    r"(?P<begin><!-- (?P<name>\w+): made by `make readme` -->\n).*?(?P<end>\n<!-- end of (?P=name) -->)", re.DOTALL
+)
+TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
+    "paper": ("paper/rmse.json", make_results_table),
+    "budget": ("paper/budget.json", make_budget_table),
+    "sigma": ("paper/sigma.json", make_sigma_table),
+    "sigma_4000": ("paper/sigma_4000.json", make_sigma_table),
+    "symmetry": ("paper/symmetry.json", make_symmetry_table),
+    "fixes": ("paper/broken_symmetry.json", make_fixes_table),
+    "seeds_1000": ("paper/seeds_1000.json", make_seed_table),
+    "quick": ("quick/rmse.json", make_results_table),
+    "seeds_quick": ("quick/seeds.json", make_seed_table),
+    "uncertainty": ("paper/uncertainty.json", make_uncertainty_table),
+    "uncertainty_quick": ("quick/uncertainty.json", make_uncertainty_table),
+}
+
+
+def main() -> None:
+    """Update the tables of some documents."""
+    parser = argparse.ArgumentParser(prog="python -m mmgsd.report.tables", description=__doc__)
+    parser.add_argument("results", type=Path, help="the folder of results, data/results")
+    parser.add_argument("documents", type=Path, nargs="+", help="Markdown files that mark tables")
+    asked = parser.parse_args()
+    for document in asked.documents:
+        update_tables(document, asked.results)
+
+
+if __name__ == "__main__":
+    run_command(main)

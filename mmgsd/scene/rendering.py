@@ -1,0 +1,371 @@
+"""The rendering stage: episodes are independent tasks on Dask, each in a child process of its own.
+
+bpy is imported in these children only (``python -m mmgsd.scene``): a crash, a leak or a killed worker costs one batch.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import importlib.metadata
+import io
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import zipfile
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from dask.distributed import Client, LocalCluster, as_completed
+from dask.system import cpu_count
+from tqdm.auto import tqdm
+
+from mmgsd.config import (
+    ADDED,
+    DEFAULT_GROUP,
+    OBJECTS,
+    OWN_GROUP,
+    RenderConfig,
+    drop_added,
+    find_root,
+    read_count,
+    read_flag,
+    to_dict,
+)
+from mmgsd.dataset import load_dataset
+from mmgsd.dataset_format import FORMAT, SPLITS, encode_table, find_owner, is_member
+from mmgsd.files import (
+    ASIDE,
+    DamagedFileError,
+    check_ours,
+    locked,
+    read_json,
+    remove_folder,
+    replace_folder,
+    saying_what_stays,
+    scratch_folder,
+    set_aside,
+    write_bytes,
+    write_json,
+)
+from mmgsd.scene.sheet import Sheet, load_sheet
+from mmgsd.symmetry import GRID_GROUPS, LINE_GROUPS, load_group, load_mirror
+
+IMAGES_A_BATCH = 30  # a child process ends after about so many, which bounds its memory
+SCENES = {"cloth": 2, "rope": 1}  # to be raised where the same configuration gives another object than before
+WORKSPACES = 1  # likewise of what is seen around the object in the scene "workspace"
+GROUPS = {"cloth": GRID_GROUPS, "rope": LINE_GROUPS}
+BATCH = re.compile(r"(train|test)_\d+\.(zip|tmp)(\.damaged)?|config\.(json|tmp)(\.damaged)?")
+LABELS = {"episode", "view", "split", "xy", "visible", "intrinsics", "camera_pose", "info"}  # of a view in a batch
+UNREADABLE = (OSError, EOFError, ValueError, TypeError, LookupError, AttributeError, NotImplementedError, RuntimeError,
+              zipfile.BadZipFile, zlib.error)  # fmt: skip  # what zipfile raises about a damaged archive
+
+_children: set[subprocess.Popen] = set()  # that render for this process now
+
+
+class RenderError(RuntimeError):
+    """Blender failed in a child process; the message ends with what it said."""
+
+
+def render_dataset(
+    config: RenderConfig, folder: Path, *,
+    only_test: bool = False, workers: int = 0, scheduler: str = "", overwrite: bool = False, progress: bool = True,
+) -> Path:  # fmt: skip
+    """Render the data set of ``config`` into ``folder`` and return it; a finished one is returned as it is.
+
+    ``only_test`` leaves out the training images: enough to evaluate models. A later call without it renders the rest.
+
+    ``workers`` processes on this machine (0: one a core that it may use), or the ``scheduler`` of an existing Dask
+    cluster by its address. Finished batches of a killed call are kept, damaged ones are rendered again.
+
+    Objects other than ``cloth`` and ``rope`` are read from ``data/objects/<name>.json`` (`mmgsd.scene.sheet`).
+
+    Raises ValueError where the folder holds another configuration, ForeignFileError where it holds anything but a data
+    set, LockedError while another process renders into it.
+    """
+    flags = {"only_test": only_test, "overwrite": overwrite, "progress": progress}
+    only_test, overwrite, progress = (read_flag(name, value) for name, value in flags.items())
+    folder, workers = Path(folder), read_count("workers", workers)
+    if not isinstance(scheduler, str):
+        raise ValueError(f"scheduler must be an address like tcp://host:8786 or '', got {scheduler!r}")
+    if not overwrite and _is_rendered(config, folder, only_test):
+        return folder
+    with locked(folder, "rendering"):
+        if not overwrite and _is_rendered(config, folder, only_test):  # by the process that held the folder before
+            return folder
+        partial = folder.with_name(folder.name + ".partial")
+        _check_places(folder, partial)
+        jobs = {name: job for name, job in plan_batches(config).items() if job["split"] == "test" or not only_test}
+        if overwrite:
+            remove_folder(partial, _is_batch_file)
+        with saying_what_stays(lambda: _describe_kept(partial, jobs)):
+            _render_missing(config, jobs, partial, workers, scheduler, progress)
+            replace_folder(_assemble(config, partial, list(jobs)), folder, find_owner(folder))
+        if not only_test:
+            remove_folder(partial, _is_batch_file)
+    return folder
+
+
+def _is_rendered(config: RenderConfig, folder: Path, only_test: bool) -> bool:
+    """Whether the images asked for are there; ValueError where another configuration's are."""
+    if not (folder / "dataset.json").is_file():
+        return False
+    info = load_dataset(folder, "test").info
+    _check_same_config(config, info["config"] | {"scenes": info["versions"].get("scenes", 1)}, folder)
+    return only_test or "train" in info["images"]
+
+
+def _check_places(folder: Path, partial: Path) -> None:
+    """Refuse folders that hold anything of others' before an hour of rendering, not after it."""
+    for place in (folder, partial):
+        if place.exists() or place.is_symlink():
+            check_ours(place, find_owner(place) if place == folder else _is_batch_file)
+
+
+def _is_batch_file(path: Path) -> bool:
+    """Whether a file of a folder of finished batches is ours: a batch, what is claimed, or a set being put together."""
+    first, *rest = path.parts
+    if rest:
+        return (first == "dataset" or ASIDE.fullmatch(first) is not None) and is_member("/".join(rest))
+    return any(pattern.fullmatch(first) for pattern in (BATCH, ASIDE))
+
+
+def _describe_kept(partial: Path, jobs: dict[str, dict]) -> str:
+    kept = sum((partial / f"{name}.zip").is_file() for name in jobs)
+    return f"rendering was stopped; {kept} of {len(jobs)} batches are kept in {partial}: call again without overwrite"
+
+
+def load_object(config: RenderConfig) -> Sheet | None:
+    """The sheet that an object's file describes; None for the cloth and the rope, which need none."""
+    return None if config.object in OBJECTS else load_sheet(find_root() / "data" / "objects" / f"{config.object}.json")
+
+
+def plan_batches(config: RenderConfig) -> dict[str, dict]:
+    """The jobs of a data set by name; they depend on the configuration alone, never on who renders them."""
+    jobs, sheet, images_of = {}, load_object(config), _describe(config)
+    described = None if sheet is None else sheet.to_dict()
+    for split, images in zip(SPLITS, (config.train_images, config.test_images), strict=True):
+        views = [min(config.views, images - start) for start in range(0, images, config.views)]
+        batch = max(1, IMAGES_A_BATCH // config.views)
+        for start in range(0, len(views), batch):
+            episodes = [[start + i, n] for i, n in enumerate(views[start : start + batch])]
+            job = {"config": to_dict(config), "split": split, "episodes": episodes, "sheet": described}
+            mark = hashlib.sha256(json.dumps([images_of, split, episodes]).encode()).hexdigest()
+            jobs[f"{split}_{start:06d}"] = {**job, "mark": mark}
+    return jobs
+
+
+def render_batch(job: dict) -> bytes:
+    """Render one job in a child process and return its zip file; RenderError where the child fails."""
+    with scratch_folder(Path(tempfile.gettempdir()), "mmgsd-batch") as folder:
+        out = folder / "batch.zip"
+        code, said = _run_child({**job, "out": str(out), "parent": os.getpid()}, folder)
+        if code or not out.is_file():
+            raise RenderError(f"rendering {job['split']} {job['episodes']} {_explain(code)}:\n{said[-2000:]}")
+        return out.read_bytes()
+
+
+def _run_child(job: dict, folder: Path) -> tuple[int, str]:
+    """Exit code and stderr of a child that renders ``job``, with ``folder`` for all its temporary files."""
+    path = os.pathsep.join([str(Path(__file__).resolve().parents[2]), os.environ.get("PYTHONPATH", "")])
+    # as many children as cores, so one thread in each
+    one = {"MMGSD_THREADS": "1", "OMP_NUM_THREADS": "1", "OIDN_NUM_THREADS": "1", "OIDN_SET_AFFINITY": "0"}
+    env = {**one, **os.environ, "PYTHONPATH": path, "TMPDIR": str(folder)}
+    pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+    # a session of its own: Ctrl-C stops the parent, which ends its children, and none of them fails and is tried again
+    with subprocess.Popen(
+        [sys.executable, "-m", "mmgsd.scene"], env=env, text=True, start_new_session=True, **pipes
+    ) as child:
+        _children.add(child)
+        try:
+            _, said = child.communicate(json.dumps(job))
+        finally:
+            _children.discard(child)
+            child.kill()
+    return child.returncode, said
+
+
+def _explain(code: int) -> str:
+    """How a child ended, from its exit code."""
+    if code >= 0:
+        return "failed"
+    name = signal.Signals(-code).name
+    short = ": memory may be short, so try fewer workers" if -code == signal.SIGKILL else ""
+    return f"failed: its process was ended by {name}{short}"
+
+
+@contextlib.contextmanager
+def _connect(workers: int, scheduler: str) -> Iterator[Client]:
+    if scheduler:
+        with Client(scheduler) as client:
+            yield client
+        return
+    threads = workers or cpu_count()  # they only wait for the children; affinity and quotas count
+    # nobody else is to reach scheduler and worker: both talk within this process, and their pages stay on this machine
+    local = {"dashboard_address": "127.0.0.1:0", "worker_dashboard_address": "127.0.0.1:0", "processes": False}
+    with _unchanged_environment(), LocalCluster(
+        n_workers=1, threads_per_worker=threads, silence_logs="ERROR", **local
+    ) as cluster, Client(cluster) as client:  # fmt: skip
+        try:
+            yield client
+        finally:
+            for child in list(_children):
+                child.kill()
+
+
+@contextlib.contextmanager
+def _unchanged_environment() -> Iterator[None]:
+    """Dask sets OMP_NUM_THREADS=1 and more in this process for good: a training later on would get a single thread."""
+    before = dict(os.environ)
+    try:
+        yield
+    finally:
+        os.environ.clear()
+        os.environ.update(before)
+
+
+def _render_missing(
+    config: RenderConfig, jobs: dict, partial: Path, workers: int, scheduler: str, progress: bool
+) -> None:
+    """Render the jobs of which ``partial`` holds no whole batch; ValueError where it holds another configuration's."""
+    claimed = _is_claimed(config, partial)
+    missing = {name: job for name, job in jobs.items() if not _is_whole(partial / f"{name}.zip", job, claimed)}
+    write_json(partial / "config.json", _describe(config))
+    if missing:
+        with _connect(workers, scheduler) as client:
+            _render_batches(client, missing, partial, config, progress)
+
+
+def _render_batches(client: Client, jobs: dict, partial: Path, config: RenderConfig, progress: bool) -> None:
+    futures = {client.submit(render_batch, job, pure=False, retries=2): name for name, job in jobs.items()}
+    total = sum(n for job in jobs.values() for _, n in job["episodes"])
+    try:
+        with tqdm(total=total, desc=f"render {config.object}", unit="image", disable=not progress) as bar:
+            for future in as_completed(list(futures)):
+                name = futures.pop(future)
+                write_bytes(partial / f"{name}.zip", future.result())
+                bar.update(sum(n for _, n in jobs[name]["episodes"]))
+    finally:
+        client.cancel(list(futures))  # after an error or a Ctrl-C, none of the rest is begun
+
+
+def _is_claimed(config: RenderConfig, partial: Path) -> bool:
+    """Whether the folder says that its batches are of this configuration; ValueError where it names another."""
+    path = partial / "config.json"
+    if not path.is_file():
+        return False
+    try:
+        stored = read_json(path)
+        if not isinstance(stored, dict):
+            raise DamagedFileError(f"{path} holds no configuration")
+    except DamagedFileError:
+        set_aside(path)
+        return False
+    _check_same_config(config, stored, partial)
+    return True
+
+
+def _is_whole(path: Path, job: dict, claimed: bool) -> bool:
+    """Whether a job's batch is there; one that is damaged, or of unknown origin, is set aside.
+
+    A batch carries its job's mark. One of before there were marks is trusted where the folder names the configuration.
+    """
+    if not path.is_file():
+        return False
+    try:
+        with zipfile.ZipFile(path) as batch:
+            labels, mark = json.loads(batch.read("labels.json")), batch.comment.decode()
+            whole = batch.testzip() is None and all(label.keys() >= LABELS for label in labels)
+        whole = whole and len(labels) == sum(n for _, n in job["episodes"])
+    except UNREADABLE:
+        whole = False
+    whole = whole and (mark == job["mark"] or (claimed and not mark))
+    if not whole:
+        set_aside(path)
+    return whole
+
+
+def _check_same_config(config: RenderConfig, stored: dict, folder: Path) -> None:
+    asked, stored = _describe(config), drop_added(stored)
+    if stored != asked:
+        there, wanted = ADDED | stored, ADDED | asked
+        changed = [f"{k}: {there.get(k)!r} there, {v!r} asked for" for k, v in wanted.items() if there.get(k) != v]
+        raise ValueError(f"{folder} holds another data set ({'; '.join(changed)}): use overwrite=True to replace it")
+
+
+def _describe(config: RenderConfig) -> dict:
+    """All that decides the images."""
+    return to_dict(config) | {"scenes": _name_scenes(config)}
+
+
+def _name_scenes(config: RenderConfig) -> int | str:
+    """Version of the object's scenes; of an object of the user's own, with the digest of what its file describes.
+
+    Of another scene than the plain one, with its name and version.
+    """
+    sheet, around = load_object(config), "" if config.scene == "plain" else f"-{config.scene}{WORKSPACES}"
+    if sheet is None:
+        return f"{SCENES[config.object]}{around}" if around else SCENES[config.object]
+    return f"{SCENES['cloth']}{around}-{hashlib.sha256(json.dumps(sheet.to_dict()).encode()).hexdigest()[:8]}"
+
+
+def _describe_symmetry(config: RenderConfig) -> dict:
+    """Image size, groups and mirror of the object, as dataset.json holds them."""
+    sheet = load_object(config)
+    if sheet is None:
+        groups = {name: load_group(config.object, name).permutations for name in GROUPS[config.object]}
+        default, mirror, size = DEFAULT_GROUP[config.object], load_mirror(config.object), config.size
+    else:
+        groups = {"identity": np.arange(len(sheet.rest))[None], OWN_GROUP: sheet.group.permutations}
+        default, mirror, size = OWN_GROUP, sheet.mirror, sheet.size
+    symmetry = {name: permutations.tolist() for name, permutations in groups.items()}
+    mirror = None if mirror is None else mirror.tolist()
+    return {"size": list(size), "default_group": default, "symmetry": symmetry, "mirror": mirror}
+
+
+def _assemble(config: RenderConfig, partial: Path, names: list[str]) -> Path:
+    """Unpack the batches of these names into a folder of the data set's format, dataset.json last."""
+    folder = partial / "dataset"
+    remove_folder(folder, lambda path: is_member(path.as_posix()))
+    for name in ("images", "masks"):
+        (folder / name).mkdir(parents=True)
+    rows = [row for name in names for row in _unpack(partial / f"{name}.zip", folder)]
+    labels = pd.DataFrame(rows)
+    table, digest = encode_table(labels)
+    (folder / "labels.parquet").write_bytes(table)
+    info = {
+        "format": FORMAT,
+        "object": config.object,
+        "images": labels.split.value_counts().to_dict(),
+        "config": to_dict(config),
+        "versions": {"scenes": _name_scenes(config), **_list_versions()},
+        **_describe_symmetry(config),
+        "labels_sha256": digest,
+    }
+    (folder / "dataset.json").write_text(json.dumps(info))
+    return folder
+
+
+def _list_versions() -> dict[str, str]:
+    return {name: importlib.metadata.version(name) for name in ("bpy", "numpy", "pillow")}
+
+
+def _unpack(path: Path, folder: Path) -> Iterator[dict]:
+    """Write a batch's files and yield its rows of labels; episodes of the test split are numbered after 1,000,000."""
+    with zipfile.ZipFile(io.BytesIO(path.read_bytes())) as batch:
+        for label in json.loads(batch.read("labels.json")):
+            split, stem = label["split"], f"{label['episode']:06d}_{label['view']:02d}"
+            names = {"file": f"images/{split}_{stem}.webp", "mask": f"masks/{split}_{stem}.png"}
+            (folder / names["file"]).write_bytes(batch.read(f"{stem}.webp"))
+            (folder / names["mask"]).write_bytes(batch.read(f"{stem}_mask.png"))
+            flat = {key: [v for row in label.pop(key) for v in row] for key in ("xy", "intrinsics", "camera_pose")}
+            flat["xy"] = np.float32(flat["xy"])
+            label["episode"] += 1_000_000 * (split == "test")
+            yield {**names, **flat, **label.pop("info"), **label}

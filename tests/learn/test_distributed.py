@@ -1,0 +1,92 @@
+"""Two processes learn what one does."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors import safe_open
+
+from mmgsd.config import TrainConfig
+from mmgsd.learn import training
+from mmgsd.learn.distributed import Team, joined
+from mmgsd.learn.training import CHECKPOINT
+
+CONFIG = TrainConfig(steps=3, batch=4, groups=2, pairs=4, queries=16, input_px=64, descriptor_dim=8)
+SCRIPT = """
+import json, sys
+from pathlib import Path
+from mmgsd.learn import training
+from mmgsd.config import TrainConfig, from_dict
+
+training._Run.finish = lambda run, weights: run.save()  # the optimiser's moments stay
+config = from_dict(TrainConfig, json.loads(sys.argv[1]))
+training.train_model(config, Path(sys.argv[2]), Path(sys.argv[3]), device="cpu", progress=False)
+"""
+
+
+def train(dataset: Path, folder: Path, *, processes: int) -> tuple[np.ndarray, torch.Tensor]:
+    """Losses of all steps, and the mean gradients that Adam keeps."""
+    script = folder.parent / "train.py"
+    script.write_text(SCRIPT)
+    launch = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={processes}"]
+    env = {**os.environ, "PYTHONPATH": str(Path(training.__file__).parents[1]), "OMP_NUM_THREADS": "1"}
+    command = [*launch, str(script), json.dumps(dataclasses.asdict(CONFIG)), str(dataset), str(folder)]
+    done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr[-2000:]
+    with safe_open(folder / CHECKPOINT, "pt") as file:
+        names = sorted(name for name in file.keys() if name.endswith("/exp_avg"))  # noqa: SIM118
+        moments = torch.cat([file.get_tensor(name).flatten() for name in names])
+        return np.array([row["loss"] for row in json.loads(file.metadata()["numbers"])["log"]]), moments
+
+
+def test_two_processes_have_the_losses_and_gradients_of_one(tiny_dataset: Callable[..., Path], tmp_path: Path) -> None:
+    dataset = tiny_dataset()
+    (losses, moments), (losses_of_two, moments_of_two) = (
+        train(dataset, tmp_path / str(n), processes=n) for n in (1, 2)
+    )
+    np.testing.assert_allclose(losses_of_two, losses, rtol=1e-3)  # the decoder computes in bfloat16
+    assert len(moments) > 1e6
+    assert (moments_of_two - moments).norm() < 0.02 * moments.norm()
+
+
+LISTENING = """
+import psutil
+from mmgsd.learn.distributed import joined
+with joined(2, "cpu") as team:
+    team.add(1.0)
+    there = psutil.Process().net_connections("inet")
+    print("listens on", sorted({c.laddr.ip for c in there if c.status == psutil.CONN_LISTEN}), flush=True)
+    team.wait()
+"""
+
+
+def test_processes_of_one_machine_listen_on_loopback_alone(tmp_path: Path) -> None:
+    (tmp_path / "listen.py").write_text(LISTENING)
+    launch = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
+    env = {**os.environ, "PYTHONPATH": str(Path(training.__file__).parents[1]), "OMP_NUM_THREADS": "1"}
+    command = [*launch, str(tmp_path / "listen.py")]
+    done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=120)
+    said = [line for line in done.stdout.splitlines() if line.startswith("listens on")]
+    assert done.returncode == 0 and len(said) == 2, done.stderr[-2000:]
+    assert set(said) <= {"listens on ['127.0.0.1']", "listens on []"}
+
+
+def test_groups_are_shared_evenly(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    with pytest.raises(ValueError, match="groups must be a multiple of the 2 processes, got 3"), joined(3, "cpu"):
+        pass
+
+
+def test_alone_a_process_has_all_groups() -> None:
+    with joined(3, "cpu") as team:
+        assert team == Team(torch.device("cpu"), (0, 1, 2))
+        assert team.add(1.5) == 1.5

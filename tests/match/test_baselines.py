@@ -1,0 +1,198 @@
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+
+from mmgsd.match.baselines import (
+    BASELINES,
+    BaselineMatcher,
+    compute_baseline_heatmap,
+    compute_descriptors,
+    compute_distances,
+    compute_grid,
+    compute_orientations,
+    list_baselines,
+)
+
+HERE = BASELINES[:-1]  # SURF is not in every OpenCV
+SIZE = (240, 200)  # width, height
+STRIDE = 8  # px, finer than the default: the image is small
+CENTRE = np.array([119.5, 99.5])
+
+
+@pytest.fixture(scope="module")
+def image():
+    rng = np.random.default_rng(3)
+    layers = [rng.random((SIZE[1] // s + 1, SIZE[0] // s + 1, 3)).astype(np.float32) for s in (6, 14, 30)]
+    total = sum(cv2.resize(layer, SIZE, interpolation=cv2.INTER_CUBIC) for layer in layers)
+    return np.clip(total * 85, 0, 255).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def mask():
+    return np.ones(SIZE[::-1], bool)
+
+
+@pytest.fixture(scope="module")
+def xy():
+    columns, rows = np.meshgrid(np.arange(80, 160, 16), np.arange(60, 140, 16))
+    return np.stack([columns, rows], -1).reshape(-1, 2) + 0.25
+
+
+def find_top(heatmap, grid):
+    return grid.reshape(-1, 2)[heatmap.reshape(len(heatmap), -1).argmax(1)]
+
+
+def turn(image, xy, degrees):
+    matrix = cv2.getRotationMatrix2D(tuple(CENTRE), degrees, 1.0)
+    turned = cv2.warpAffine(image, matrix, SIZE, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    return turned, np.c_[xy, np.ones(len(xy))] @ matrix.T
+
+
+@pytest.mark.parametrize("method", HERE)
+def test_heatmap_is_a_distribution_on_the_object(method, image, mask, xy):
+    half = mask.copy()
+    half[:, :100] = False
+    heatmap, grid = compute_baseline_heatmap(image, image, xy, half, method=method, stride=STRIDE)
+    assert heatmap.shape == (len(xy), 25, 30)
+    assert heatmap.dtype == np.float32
+    assert grid.shape == (25, 30, 2)
+    np.testing.assert_allclose(heatmap.sum((1, 2)), 1, atol=1e-4)
+    assert (heatmap >= 0).all()
+    assert not heatmap[:, grid[..., 0] < 99].any()
+
+
+@pytest.mark.parametrize("method", HERE)
+def test_an_image_matches_itself(method, image, mask, xy):
+    heatmap, grid = compute_baseline_heatmap(image, image, xy, mask, method=method, stride=STRIDE)
+    errors = np.linalg.norm(find_top(heatmap, grid) - xy, axis=1)
+    assert np.median(errors) <= 8  # the cell's own extent
+
+
+@pytest.mark.parametrize("method", ["sift", "orb", "akaze"])
+@pytest.mark.parametrize("degrees", [35, 90, -140])
+def test_a_turned_image_matches(method, degrees, image, mask, xy):
+    turned, true = turn(image, xy, degrees)
+    heatmap, grid = compute_baseline_heatmap(image, turned, xy, mask, method=method, stride=STRIDE)
+    errors = np.linalg.norm(find_top(heatmap, grid) - true, axis=1)
+    assert np.median(errors) <= 8
+
+
+@pytest.mark.parametrize("method", ["sift", "orb"])
+def test_orientation_turns_with_the_image(method, image, xy):
+    turned, true = turn(image, xy, 90)  # counter-clockwise as seen: y points down
+    before, after = (
+        compute_orientations(cv2.cvtColor(im, cv2.COLOR_RGB2GRAY), points, method=method)
+        for im, points in ((image, xy), (turned, true))
+    )
+    difference = (before - after - 90 + 180) % 360 - 180
+    assert np.median(np.abs(difference)) < 5
+
+
+@pytest.mark.parametrize(("method", "tolerance"), [("sift", 6), ("orb", 1)])
+def test_orientation_of_a_ramp_is_its_gradient(method, tolerance):
+    rows, columns = np.mgrid[:200, :240]
+    angle = np.radians(33)
+    ramp = np.rint(128 + 0.8 * (np.cos(angle) * (columns - 119) + np.sin(angle) * (rows - 99))).clip(0, 255)
+    got = compute_orientations(ramp.astype(np.uint8), np.array([[119.0, 99.0]]), method=method)
+    assert got[0] == pytest.approx(33, abs=tolerance)  # SIFT's bins are 10 degrees wide
+
+
+@pytest.mark.parametrize("method", HERE)
+def test_no_point_is_dropped_at_the_border(method, image):
+    corners = np.array([[-0.5, -0.5], [239.5, -0.5], [-0.5, 199.5], [239.5, 199.5], [0, 100]])
+    descriptors = compute_descriptors(image, corners, method=method)
+    assert descriptors.shape[0] == 5
+    assert descriptors.dtype == np.float32
+    assert np.isfinite(descriptors).all()
+
+
+@pytest.mark.parametrize("method", HERE)
+def test_a_plain_image_gives_a_uniform_heatmap(method, image, mask, xy):
+    plain = np.full_like(image, 90)
+    heatmap, _ = compute_baseline_heatmap(plain, plain, xy[:3], mask, method=method, stride=STRIDE)
+    np.testing.assert_allclose(heatmap, 1 / heatmap[0].size, rtol=0.02)  # DAISY's rounding
+
+
+def test_distances_by_hand():
+    source = np.array([[1, 1, 1], [1, -1, -1]], np.float32)
+    target = np.array([[1, 1, -1], [1, -1, -1]], np.float32)
+    assert compute_distances(source, target).tolist() == [[4, 8], [4, 0]]  # four times the Hamming distance
+
+
+def test_grid_cells_lie_where_documented():
+    grid = compute_grid((485, 640), stride=8)
+    assert grid.shape == (61, 80, 2)
+    assert grid[0, 0].tolist() == [3.5, 3.5]
+    assert grid[2, 5].tolist() == [3.5 + 8 * 5, 3.5 + 8 * 2]
+    assert grid[-1, -1].tolist() == [635.5, 483.5]
+
+
+def test_no_query_gives_an_empty_heatmap(image, mask):
+    heatmap, _ = compute_baseline_heatmap(image, image, np.zeros((0, 2)), mask, method="orb", stride=STRIDE)
+    assert heatmap.shape == (0, 25, 30)
+
+
+def test_surf_is_used_where_opencv_has_it(image, mask, xy, monkeypatch):
+    monkeypatch.setattr(cv2, "xfeatures2d", SimpleNamespace(SURF_create=cv2.SIFT_create), raising=False)
+    heatmap, grid = compute_baseline_heatmap(image, image, xy, mask, method="surf", stride=STRIDE)
+    assert np.median(np.linalg.norm(find_top(heatmap, grid) - xy, axis=1)) <= 8
+
+
+def test_surf_is_refused_where_opencv_lacks_it(image, mask, xy, monkeypatch):
+    monkeypatch.delattr(cv2, "xfeatures2d", raising=False)
+    with pytest.raises(ValueError, match="non-free modules.*'sift', 'orb', 'akaze', 'daisy'"):
+        compute_baseline_heatmap(image, image, xy, mask, method="surf", stride=STRIDE)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"method": "lift"}, "method must be one of 'sift'.*got 'lift'"),
+        ({"image0": np.zeros((200, 240), np.uint8)}, r"image0 must be an RGB image.*got uint8 \(200, 240\)"),
+        ({"image1": np.zeros((200, 240, 4), np.uint8)}, r"image1 must be.*\(200, 240, 4\)"),
+        ({"image1": np.zeros((200, 240, 3))}, "image1 must be.*float64"),
+        ({"image0": None}, "image0 must be.*NoneType"),
+        ({"xy": np.zeros((2, 3))}, r"xy must be \(S, 2\) px, got shape \(2, 3\)"),
+        ({"xy": [[1, 1], [240, 10]]}, r"inside image0 of 240 x 200 px, got \(240.0, 10.0\)"),
+        ({"xy": [[np.nan, 1]]}, "xy must be finite"),
+        ({"mask1": np.ones((200, 240))}, "mask1 must be bool.*float64"),
+        ({"mask1": np.ones((20, 24), bool)}, r"mask1 must be bool of shape \(200, 240\)"),
+        ({"mask1": np.zeros((200, 240), bool)}, "at least one cell"),
+        ({"stride": 0}, "stride must be an integer from 1 to the image's 200 px, got 0"),
+        ({"stride": 2.5}, "stride must be an integer.*got 2.5"),
+    ],
+)
+def test_bad_arguments_are_named(change, message, image, mask, xy):
+    arguments = {"image0": image, "image1": image, "xy": xy, "mask1": mask, "method": "orb", **change}
+    method, stride = arguments.pop("method"), arguments.pop("stride", 8)
+    with pytest.raises(ValueError, match=message):
+        compute_baseline_heatmap(**arguments, method=method, stride=stride)
+
+
+@pytest.mark.parametrize("method", HERE)
+def test_a_baseline_answers_as_a_matcher_does(method, image, mask):
+    match = BaselineMatcher(method, modes=4).match(image, image, [(100, 90), (130.5, 110)], mask1=mask)
+    assert (match.modes.shape, match.covariances.shape, match.heatmap.shape) == ((2, 4, 2), (2, 4, 2, 2), (2, 200, 240))
+    nearest = np.linalg.norm(match.modes - match.xy[:, None], axis=-1).min(1)
+    assert nearest.max() < 24  # one and a half of the grid's cells: four modes share one peak and the noise around it
+    assert match.best().xy.shape == (2, 2)
+
+
+def test_a_baseline_takes_images_as_a_matcher_does(image):
+    grey = image[..., 0].astype(np.float32) / 255
+    match = BaselineMatcher("sift").match(grey, np.dstack([image, image[..., :1]]), [], n="auto")
+    assert (match.image0.shape, match.image1.shape, len(match.modes)) == ((200, 240, 3), (200, 240, 3), 0)
+
+
+def test_an_unknown_baseline():
+    with pytest.raises(ValueError, match="method must be one of 'sift'.*got 'lift'"):
+        BaselineMatcher("lift")
+
+
+def test_surf_is_listed_where_opencv_has_it(monkeypatch):
+    monkeypatch.delattr(cv2, "xfeatures2d", raising=False)
+    assert list_baselines() == HERE
+    monkeypatch.setattr(cv2, "xfeatures2d", SimpleNamespace(SURF_create=cv2.SIFT_create), raising=False)
+    assert list_baselines() == BASELINES

@@ -1,0 +1,43 @@
+"""Pixels and rays: by hand, there and back, and bad arguments."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mmgsd.match.camera import compute_pixels, compute_rays
+
+INTRINSICS = np.array([[500.0, 0, 242], [0, 500, 242], [0, 0, 1]])
+
+
+def test_principal_point_looks_forward() -> None:
+    np.testing.assert_allclose(compute_rays([242, 242], INTRINSICS), [0, 0, 1])
+
+
+def test_ray_by_hand() -> None:
+    np.testing.assert_allclose(compute_rays([[242 + 500, 242]], INTRINSICS), [[np.sqrt(0.5), 0, np.sqrt(0.5)]])
+
+
+def test_there_and_back(rng: np.random.Generator) -> None:
+    xy = rng.uniform(0, 485, (4, 7, 2))
+    rays = compute_rays(xy, INTRINSICS.ravel())
+    np.testing.assert_allclose(np.linalg.norm(rays, axis=-1), 1)
+    np.testing.assert_allclose(compute_pixels(3.7 * rays, INTRINSICS), xy)
+
+
+def test_what_is_behind_or_unknown_has_no_pixel() -> None:
+    assert np.isnan(compute_pixels([[0, 0, -1.0], [1, 0, 0]], INTRINSICS)).all()
+    assert np.isnan(compute_rays([np.nan, 3], INTRINSICS)).all()
+
+
+@pytest.mark.parametrize("bad", [np.eye(2), np.zeros((3, 3)), np.arange(9)])
+def test_no_intrinsics(bad: np.ndarray) -> None:
+    with pytest.raises(ValueError, match="intrinsics must be a 3 x 3 matrix whose last row is 0 0 1, got"):
+        compute_rays([1, 2], bad)
+
+
+def test_other_shapes() -> None:
+    with pytest.raises(ValueError, match=r"xy must have shape \(…, 2\), got \(3,\)"):
+        compute_rays([1, 2, 3], INTRINSICS)
+    with pytest.raises(ValueError, match=r"points must have shape \(…, 3\), got \(\)"):
+        compute_pixels(5, INTRINSICS)

@@ -1,0 +1,279 @@
+"""The mixture's fit: known mixtures, beside scikit-learn, degenerate heatmaps, the number of modes."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from heatmaps import CELL_PX, CELLS, CORNERS, XS, YS, draw_mixture, one_cell
+from sklearn.mixture import GaussianMixture
+from torch import Tensor
+
+from mmgsd.learn.network import compute_cell_centres
+from mmgsd.match import mixture
+from mmgsd.match.mixture import fit_modes
+from mmgsd.measure.metrics import compute_mode_errors
+
+
+def measure_errors(modes: np.ndarray, true: np.ndarray) -> np.ndarray:
+    return compute_mode_errors(np.asarray(modes, dtype=float)[None], true[None])[0]
+
+
+@pytest.mark.parametrize(
+    ("n", "std_px"),
+    [(1, 8.0), (2, 8.0), (4, 8.0), (1, 16.0), (2, 16.0), (4, 16.0), (1, 32.0), (4, 32.0)],
+)
+def test_separated_modes_are_found_below_a_cells_size(n: int, std_px: float) -> None:
+    true = CORNERS[:n]
+    fit = fit_modes(draw_mixture(true, std_px), n, XS, YS)
+    # a mode of 32 px, 100 px from the image's border, has a thousandth of its mass beyond it
+    assert measure_errors(fit.modes[0], true).max() < (0.1 if std_px < 32 else 0.15)
+
+
+def test_random_separated_modes(rng: np.random.Generator) -> None:
+    for _ in range(20):
+        true = CORNERS + rng.uniform(-40, 40, (4, 2))
+        fit = fit_modes(draw_mixture(true, 12.0), 4, XS, YS)
+        assert measure_errors(fit.modes[0], true).max() < 0.1
+
+
+def test_a_modes_position_inside_its_cell_is_found() -> None:
+    offsets = np.linspace(0, CELL_PX, 8)
+    true = np.stack([200 + offsets, 300 - offsets], -1)[:, None]
+    fit = fit_modes(torch.cat([draw_mixture(t, 6.0) for t in true]), 1, XS, YS)
+    assert compute_mode_errors(fit.modes.double().numpy(), true).max() < 0.1
+
+
+def test_weights_are_found_and_sorted() -> None:
+    weights = np.array([0.2, 0.3, 0.22, 0.28])
+    fit = fit_modes(draw_mixture(CORNERS, 8.0, weights), 4, XS, YS)
+    order = np.argsort(-weights)
+    np.testing.assert_allclose(fit.modes[0], CORNERS[order], atol=0.1)
+    np.testing.assert_allclose(fit.weights[0], weights[order], atol=1e-3)
+
+
+def test_less_of_a_prior_keeps_a_narrow_mode_out_of_a_wide_one() -> None:
+    true = np.array([[200.0, 240.0], [290.0, 240.0]])
+    heatmap = (draw_mixture(true[:1], 8.0) + draw_mixture(true[1:], 60.0)) / 2
+    errors = [measure_errors(fit_modes(heatmap, 2, XS, YS, roundness=r).modes[0], true) for r in (0.05, 0.2, 5.0)]
+    assert errors[0].max() < errors[1].max() < errors[2].max()
+
+
+@pytest.mark.parametrize("roundness", [0.0, -1.0, float("nan")])
+def test_another_roundness_is_refused(roundness: float) -> None:
+    with pytest.raises(ValueError, match="roundness must be greater than 0, got"):
+        fit_modes(one_cell(3, 3), 1, XS, YS, roundness=roundness)
+
+
+def test_a_weak_mode_beside_a_strong_one_is_found() -> None:
+    fit = fit_modes(draw_mixture(CORNERS, 8.0, np.array([0.2, 0.4, 0.1, 0.3])), 4, XS, YS)
+    assert measure_errors(fit.modes[0], CORNERS).max() < 0.1
+
+
+def test_annealing_finds_wide_and_weak_modes_among_noise(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    heatmaps, true = [], CORNERS + rng.uniform(-40, 40, (60, 4, 2))
+    for modes in true:
+        clean = draw_mixture(modes, np.exp(rng.uniform(np.log(10), np.log(60), 4)), rng.dirichlet(np.full(4, 4.0)))
+        heatmaps.append(clean * torch.from_numpy(np.exp(rng.normal(0, 0.5, clean.shape))).float())
+
+    def measure() -> float:
+        fit = fit_modes(torch.cat(heatmaps), 4, XS, YS)
+        return np.sqrt(np.square(compute_mode_errors(fit.modes.double().numpy(), true)).mean(1)).mean()
+
+    annealed = measure()
+    monkeypatch.setattr(mixture, "ANNEALING", ())
+    assert annealed < 0.6 * measure()
+
+
+@pytest.mark.parametrize("shape", [(64, 64), (63, 64), (64, 61), (33, 47), (5, 4)])
+def test_any_grid_will_do(shape: tuple[int, int]) -> None:
+    xs, ys = compute_cell_centres((640, 480), shape)
+    true = np.array([[410.0, 130.0]])
+    x, y = np.meshgrid(xs, ys)
+    width = 2 * float(xs[1] - xs[0])
+    heatmap = torch.from_numpy(np.exp(-((x - true[0, 0]) ** 2 + (y - true[0, 1]) ** 2) / (2 * width**2)))[None]
+    moments = (heatmap[0] * torch.from_numpy(np.stack([x, y]))).sum((1, 2)) / heatmap.sum()
+    np.testing.assert_allclose(fit_modes(heatmap, 1, xs, ys).modes[0, 0], moments, atol=0.1 * float(xs[1] - xs[0]))
+
+
+def test_covariance_is_the_modes() -> None:
+    fit = fit_modes(draw_mixture(CORNERS[:1] + 140, 20.0), 1, XS, YS)
+    expected = np.eye(2) * (20.0**2 + CELL_PX**2 / 6)  # of the heatmap's pixels, between which cells are interpolated
+    np.testing.assert_allclose(fit.covariances[0, 0], expected, rtol=0.01, atol=1)
+
+
+def test_covariances_are_those_of_the_full_heatmap() -> None:
+    cells = draw_mixture(CORNERS[:1] + 140, 12.0)
+    pixels = cv2.resize(cells[0].numpy(), (485, 485), interpolation=cv2.INTER_LINEAR)
+    x, y = np.meshgrid(np.arange(485), np.arange(485))
+    expected = np.cov(np.stack([x.ravel(), y.ravel()]), aweights=pixels.ravel(), bias=True)
+    np.testing.assert_allclose(fit_modes(cells, 1, XS, YS).covariances[0, 0], expected, rtol=0.02, atol=1)
+
+
+def test_an_oblong_mode_keeps_its_shape() -> None:
+    x, y = np.meshgrid(XS.numpy() - 240, YS.numpy() - 240)
+    heatmap = torch.from_numpy(
+        np.exp(-((0.8 * x + 0.6 * y) ** 2) / (2 * 60**2) - (0.8 * y - 0.6 * x) ** 2 / (2 * 15**2))
+    )
+    covariance = fit_modes(heatmap[None], 1, XS, YS).covariances[0, 0]
+    variances, axes = torch.linalg.eigh(covariance - torch.eye(2) * CELL_PX**2 / 6)
+    np.testing.assert_allclose(variances.sqrt(), [15, 60], rtol=0.02)
+    np.testing.assert_allclose(axes[:, 1].abs(), [0.8, 0.6], atol=0.01)
+
+
+def test_five_per_cent_lie_outside_the_ellipse() -> None:
+    assert fit_modes(draw_mixture(CORNERS, 24.0), 4, XS, YS).outside.item() == pytest.approx(0.05, abs=0.01)
+
+
+def test_a_place_without_a_mode_lies_outside() -> None:
+    heatmap = draw_mixture(CORNERS[:2], 8.0, np.array([0.97, 0.03]))
+    assert fit_modes(heatmap, 1, XS, YS).outside.item() == pytest.approx(0.03, abs=0.02)
+
+
+@pytest.mark.parametrize("std_px", [4.0, 8.0, 16.0, 32.0])
+@pytest.mark.parametrize("n", [1, 2, 3, 4])
+def test_the_number_of_modes_is_found(n: int, std_px: float) -> None:
+    fit = fit_modes(draw_mixture(CORNERS[:n], std_px), "auto", XS, YS)
+    assert int((fit.weights > 0).sum()) == n
+    assert measure_errors(fit.modes[0, :n], CORNERS[:n]).max() < 0.15
+    assert torch.isnan(fit.modes[0, n:]).all()
+
+
+def test_each_query_finds_its_own_number() -> None:
+    heatmap = torch.cat([draw_mixture(CORNERS[:n], 12.0) for n in (3, 1, 4)])
+    assert (fit_modes(heatmap, "auto", XS, YS).weights > 0).sum(1).tolist() == [3, 1, 4]
+
+
+def test_modes_too_near_to_tell_apart_are_one() -> None:
+    assert (fit_modes(draw_overlapping(1.0)[1], "auto", XS, YS).weights > 0).sum(1).tolist() == [1] * 12
+
+
+def test_queries_do_not_disturb_each_other() -> None:
+    heatmaps = torch.cat([draw_mixture(CORNERS[:2] + k, 5.0 * k) for k in (1, 2, 3, 4)])
+    together, alone = fit_modes(heatmaps, 2, XS, YS), [fit_modes(h[None], 2, XS, YS) for h in heatmaps]
+    torch.testing.assert_close(together.modes, torch.cat([f.modes for f in alone]), rtol=0, atol=1e-3)
+
+
+def test_chunks_do_not_change_the_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    heatmaps = draw_overlapping(2.0)[1]
+    whole = fit_modes(heatmaps, 2, XS, YS)
+    monkeypatch.setitem(mixture.CHUNK, "cpu", 2 * 5 * CELLS**2)  # five queries at a time
+    parts = fit_modes(heatmaps, 2, XS, YS)
+    assert compute_mode_errors(parts.modes.numpy(), whole.modes.numpy()).max() < 0.01  # equal ones in any order
+
+
+def draw_overlapping(separation: float, std_px: float = 24.0) -> tuple[np.ndarray, Tensor]:
+    """Twelve pairs of modes (12, 2, 2) px, ``separation`` stds apart in any direction, and their heatmaps."""
+    rng, true = np.random.default_rng(0), []
+    for _ in range(12):
+        angle = rng.uniform(0, np.pi)
+        half = 0.5 * separation * std_px * np.array([np.cos(angle), np.sin(angle)])
+        true.append(rng.uniform(180, 300, 2) + np.array([half, -half]))
+    return np.array(true), torch.cat([draw_mixture(t, std_px) for t in true])
+
+
+def fit_with_scikit_learn(heatmap: Tensor, rng: np.random.Generator, samples: int = 3000) -> np.ndarray:
+    mass = heatmap.double().flatten().numpy()
+    drawn = rng.choice(len(mass), samples, p=mass / mass.sum())
+    xy = np.stack([XS.numpy()[drawn % CELLS], YS.numpy()[drawn // CELLS]], -1)
+    xy = xy + rng.uniform(-CELL_PX / 2, CELL_PX / 2, xy.shape)
+    return GaussianMixture(2, random_state=0).fit(xy).means_
+
+
+@pytest.mark.parametrize("separation", [1.5, 2.0, 3.0])
+def test_overlapping_modes_are_found_within_half_a_cell(separation: float) -> None:
+    true, heatmaps = draw_overlapping(separation)
+    assert compute_mode_errors(fit_modes(heatmaps, 2, XS, YS).modes.double().numpy(), true).mean() < CELL_PX / 2
+
+
+@pytest.mark.parametrize("separation", [1.5, 2.0, 3.0])
+def test_overlapping_modes_no_worse_than_scikit_learn(separation: float, rng: np.random.Generator) -> None:
+    true, heatmaps = draw_overlapping(separation)
+    ours = fit_modes(heatmaps, 2, XS, YS).modes.double().numpy()
+    theirs = np.stack([fit_with_scikit_learn(heatmap, rng) for heatmap in heatmaps])
+    assert compute_mode_errors(ours, true).mean() <= compute_mode_errors(theirs, true).mean()
+
+
+DEGENERATE = {
+    "flat": torch.full((1, CELLS, CELLS), 1 / CELLS**2),
+    "nothing": torch.zeros(1, CELLS, CELLS),
+    "one cell": one_cell(20, 33),
+    "first corner": one_cell(0, 0),
+    "last corner": one_cell(CELLS - 1, CELLS - 1),
+    "two cells": one_cell(0, CELLS - 1) + one_cell(CELLS - 1, 0),
+    "tiny": draw_mixture(CORNERS, 8.0) * 1e-20,
+    "huge": draw_mixture(CORNERS, 8.0) * 1e20,
+    "half on the edge": draw_mixture(np.array([[0.0, 200.0], [484.0, 300.0]]), 30.0),
+}
+
+
+@pytest.mark.parametrize("name", DEGENERATE)
+def test_any_heatmap_has_a_number_of_modes(name: str) -> None:
+    fit = fit_modes(DEGENERATE[name], "auto", XS, YS)
+    present = fit.weights[0] > 0
+    assert 1 <= present.sum() <= 8
+    assert ((fit.modes[0, present] >= -0.5) & (fit.modes[0, present] <= 484.5)).all()
+
+
+@pytest.mark.parametrize("n", [1, 2, 4, 8])
+@pytest.mark.parametrize("name", DEGENERATE)
+def test_fit_is_sound_on_any_heatmap(name: str, n: int) -> None:
+    fit = fit_modes(DEGENERATE[name], n, XS, YS)
+    assert (fit.modes.shape, fit.weights.shape, fit.covariances.shape) == ((1, n, 2), (1, n), (1, n, 2, 2))
+    assert ((fit.modes >= -0.5) & (fit.modes <= 484.5)).all()  # false for NaN
+    assert fit.weights.sum().item() == pytest.approx(1)
+    assert (fit.weights[0].diff() <= 0).all()
+    assert torch.linalg.eigvalsh(fit.covariances).min() > 0
+    assert 0 <= fit.outside.item() <= 1
+
+
+def test_one_cell_is_its_own_mode() -> None:
+    fit = fit_modes(one_cell(7, 30), 1, XS, YS)
+    torch.testing.assert_close(fit.modes[0, 0], torch.stack([XS[30], YS[7]]))
+    corner = fit_modes(one_cell(0, CELLS - 1), 1, XS, YS).modes[0, 0]  # whose mass has only one side to spread to
+    assert (corner - torch.stack([XS[-1], YS[0]])).abs().max() < 0.1 * CELL_PX
+
+
+def test_double_heatmaps_are_taken() -> None:
+    one, two = (fit_modes(draw_mixture(CORNERS, 8.0).to(t), 4, XS, YS) for t in (torch.float32, torch.float64))
+    torch.testing.assert_close(one.modes, two.modes, rtol=0, atol=0.01)
+
+
+def test_each_query_has_its_own_number_of_modes() -> None:
+    heatmap = torch.cat([draw_mixture(CORNERS[:1], 8.0), draw_mixture(CORNERS, 8.0), draw_mixture(CORNERS[:2], 8.0)])
+    fit = fit_modes(heatmap, torch.tensor([1, 4, 2]), XS, YS)
+    assert torch.isfinite(fit.modes).all(-1).tolist() == [[True] + 3 * [False], 4 * [True], 2 * [True] + 2 * [False]]
+    assert ((fit.weights > 0) == torch.isfinite(fit.modes).all(-1)).all()
+    torch.testing.assert_close(fit.weights.sum(1), torch.ones(3))
+    assert measure_errors(fit.modes[2, :2], CORNERS[:2]).max() < 0.1 * CELL_PX
+
+
+def test_no_query_no_mode() -> None:
+    fit = fit_modes(torch.zeros(0, CELLS, CELLS), 4, XS, YS)
+    assert (fit.modes.shape[0], fit.modes.shape[2]) == (0, 2)
+
+
+@pytest.mark.parametrize("n", [0, -1])
+def test_at_least_one_mode(n: int) -> None:
+    with pytest.raises(ValueError, match=f"n must be at least 1, got {n}"):
+        fit_modes(one_cell(3, 3), n, XS, YS)
+
+
+@pytest.mark.parametrize("shape", [(CELLS, CELLS), (1, CELLS, CELLS - 1)])
+def test_heatmap_of_another_shape(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=r"heatmap must have shape \(S, 64, 64\), got"):
+        fit_modes(torch.ones(shape), 1, XS, YS)
+
+
+def test_number_of_modes_of_another_length() -> None:
+    with pytest.raises(ValueError, match=r"n must be one number or of shape \(1,\), got shape \(3,\)"):
+        fit_modes(one_cell(3, 3), torch.tensor([1, 2, 3]), XS, YS)
+
+
+@pytest.mark.parametrize(("n", "message"), [(2.5, "an integer, .*got torch.float32"), ("many", "'auto', got 'many'")])
+def test_another_kind_of_number(n: object, message: str) -> None:
+    with pytest.raises(ValueError, match=f"n must be .*{message}"):
+        fit_modes(one_cell(3, 3), n, XS, YS)

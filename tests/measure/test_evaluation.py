@@ -1,0 +1,331 @@
+"""Evaluation: the truth scores zero, tables hold one row a query, finished tables are left alone."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from mmgsd.config import EvaluateConfig, TrainConfig
+from mmgsd.dataset import Dataset, load_dataset
+from mmgsd.learn.network import build_network, compute_cell_centres
+from mmgsd.match.matcher import Matcher
+from mmgsd.match.mixture import Mixture
+from mmgsd.measure import evaluation
+from mmgsd.measure.evaluation import (
+    BANDWIDTHS,
+    BASELINES,
+    calibrate_bandwidth,
+    calibrate_temperature,
+    choose_points,
+    evaluate_baseline,
+    evaluate_model,
+    load_queries,
+    measure_rmse,
+    summarise,
+    write_results,
+)
+
+CONFIG = EvaluateConfig(pairs=3, points=5)
+CLOTH_SIDE_PX = 240.0  # of the synthetic cloths
+
+
+def ask_baseline(method: str, dataset: Path, out: Path, config: EvaluateConfig = CONFIG) -> pd.DataFrame:
+    return load_queries(evaluate_baseline(method, dataset, config, out, progress=False))
+
+
+def write_weights(folder: Path, content: bytes = b"weights") -> Path:
+    """A file that stands for trained weights: the evaluation reads its bytes to know it again."""
+    path = folder / "weights.safetensors"
+    path.write_bytes(content)
+    return path
+
+
+def answer_with_the_truth(group: str, shift: float) -> object:
+    """Stands for a model that knows the labels: the true modes, moved by ``shift`` px along x."""
+
+    def make(matcher: object, data: Dataset, config: EvaluateConfig) -> evaluation.Answer:
+        def answer(first: int, second: int, xy: np.ndarray, n: np.ndarray) -> tuple[Mixture, torch.Tensor]:
+            modes = np.full((len(xy), n.max(), 2), np.nan)
+            for row, point in enumerate(choose_points(CONFIG.points, 625)):
+                modes[row, : n[row]] = data.xy[second, data.group(group).distinct_modes(point)[::-1]] + [shift, 0]
+            covariances = torch.eye(2).repeat(*modes.shape[:2], 1, 1)
+            nothing = torch.zeros(len(xy))
+            return Mixture(torch.from_numpy(modes), torch.ones(modes.shape[:2]), covariances, nothing), nothing
+
+        return answer
+
+    return make
+
+
+@pytest.fixture
+def ask_oracle(monkeypatch: pytest.MonkeyPatch, cloth_dataset: Path, tmp_path: Path) -> object:
+    def ask(group: str = "", *, shift: float = 0.0) -> pd.DataFrame:
+        monkeypatch.setattr(evaluation.Matcher, "load", lambda path: None)
+        monkeypatch.setattr(evaluation, "_model_answer", answer_with_the_truth(group, shift))
+        out = tmp_path / f"oracle{group}.parquet"
+        return load_queries(
+            evaluate_model(write_weights(tmp_path), cloth_dataset, CONFIG, out, group=group, progress=False)
+        )
+
+    return ask
+
+
+@pytest.mark.parametrize("group", ["", "identity", "c2", "v4", "d4"])
+def test_the_truth_has_no_error(ask_oracle: object, group: str) -> None:
+    queries = ask_oracle(group)
+    assert (queries.rmse_px == 0).all()
+    assert (queries["pck@5px"] == 1).all()
+
+
+def test_a_shifted_truth_is_wrong_by_the_shift(ask_oracle: object) -> None:
+    queries = ask_oracle(shift=3.0)
+    np.testing.assert_allclose(queries[["rmse_px", "nearest_px", "best_px"]], 3.0, rtol=1e-5)
+    np.testing.assert_allclose(np.concatenate(queries.mahalanobis2), 9.0, rtol=1e-5)
+    assert queries.mahalanobis2.map(len).equals(queries.n)
+
+
+def test_coinciding_modes_are_merged(ask_oracle: object) -> None:
+    queries = ask_oracle()  # points 0, 156, 312, 468, 624 of 625: the third is the cloth's centre
+    assert queries[queries["pair"] == 0].n.tolist() == [4, 4, 1, 4, 4]
+
+
+def test_one_row_a_query(cloth_dataset: Path, tmp_path: Path) -> None:
+    queries = ask_baseline("centre", cloth_dataset, tmp_path / "centre.parquet")
+    assert list(queries.columns) == [
+        "pair", "image0", "image1", "point", "visible", "n", "entropy", "hidden", "outside", "mahalanobis2",
+        "rmse_px", "nearest_px", "best_px", "swapped", "pck@5px", "pck@10px", "pck@20px",
+    ]  # fmt: skip
+    assert len(queries) == CONFIG.pairs * CONFIG.points
+    assert not queries.duplicated(["pair", "point"]).any()
+    unknown = ["visible", "outside", "mahalanobis2"]  # chance has no heatmap
+    assert np.isfinite(queries.drop(columns=unknown).to_numpy(dtype=float)).all()
+    assert queries.outside.isna().all()
+    assert np.isnan(np.concatenate(queries.mahalanobis2)).all()
+
+
+def test_pairs_show_different_simulations(cloth_dataset: Path, tmp_path: Path) -> None:
+    queries = ask_baseline("centre", cloth_dataset, tmp_path / "centre.parquet")
+    episode = load_dataset(cloth_dataset, "test").episode
+    assert (episode[queries.image0] != episode[queries.image1]).all()
+
+
+def test_methods_are_asked_the_same(cloth_dataset: Path, tmp_path: Path) -> None:
+    one, two = (ask_baseline(m, cloth_dataset, tmp_path / f"{m}.parquet") for m in ("centre", "random"))
+    questions = ["pair", "image0", "image1", "point", "visible", "n"]
+    pd.testing.assert_frame_equal(one[questions], two[questions])
+
+
+def test_the_centres_error_on_a_flat_square(cloth_dataset: Path, tmp_path: Path) -> None:
+    queries = ask_baseline("centre", cloth_dataset, tmp_path / "centre.parquet").set_index("point").rmse_px
+    corner, inner = CLOTH_SIDE_PX / np.sqrt(2), CLOTH_SIDE_PX / 24 * np.hypot(6, 6)  # 156 is row 6, column 6
+    assert queries[0].tolist() == pytest.approx([corner] * 3, abs=1)
+    assert queries[156].tolist() == pytest.approx([inner] * 3, abs=1)
+    assert queries[312].tolist() == pytest.approx([0] * 3, abs=1)
+
+
+@pytest.mark.parametrize("method", BASELINES)
+def test_classical_descriptors_answer(cloth_dataset: Path, tmp_path: Path, method: str) -> None:
+    config = EvaluateConfig(pairs=1, points=3)
+    queries = ask_baseline(method, cloth_dataset, tmp_path / f"{method}.parquet", config)
+    assert len(queries) == 3
+    assert np.isfinite(queries.rmse_px).all()
+    assert queries.outside.between(0, 1).all()
+
+
+def test_hidden_matches_are_counted(cloth_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = load_dataset(cloth_dataset, "test")
+    visible = data.visible.copy()
+    visible[:, [0, 24]] = False  # two of the four corners
+    monkeypatch.setitem(data.__dict__, "visible", visible)
+    monkeypatch.setattr(evaluation, "load_dataset", lambda *_: data)
+    queries = ask_baseline("centre", cloth_dataset, tmp_path / "centre.parquet")
+    assert queries[queries["pair"] == 0].hidden.tolist() == [2, 0, 0, 0, 2]
+
+
+def test_unknown_baseline(cloth_dataset: Path, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="method must be one of .*'sift', 'orb', .*'centre', 'random'.*, got 'hog'"):
+        ask_baseline("hog", cloth_dataset, tmp_path / "hog.parquet")
+
+
+def test_a_finished_table_is_left_alone(cloth_dataset: Path, tmp_path: Path) -> None:
+    out = tmp_path / "centre.parquet"
+    ask_baseline("centre", cloth_dataset, out)
+    before = out.stat().st_mtime_ns
+    ask_baseline("centre", cloth_dataset, out)
+    assert out.stat().st_mtime_ns == before
+
+
+def test_a_table_of_other_questions_is_asked_again(cloth_dataset: Path, tmp_path: Path) -> None:
+    out = tmp_path / "centre.parquet"
+    assert len(ask_baseline("centre", cloth_dataset, out)) == 15
+    assert len(ask_baseline("centre", cloth_dataset, out, EvaluateConfig(pairs=1, points=5))) == 5
+
+
+def test_a_damaged_table_is_asked_again(cloth_dataset: Path, tmp_path: Path) -> None:
+    out = tmp_path / "centre.parquet"
+    out.write_bytes(b"truncated")
+    assert len(ask_baseline("centre", cloth_dataset, out)) == 15
+
+
+def test_other_weights_are_asked_again(ask_oracle: object, cloth_dataset: Path, tmp_path: Path) -> None:
+    out = tmp_path / "oracle.parquet"
+    ask_oracle()
+    kept = evaluation._is_answered(out, load_queries(out).attrs)
+    other = evaluation._describe_question(load_dataset(cloth_dataset, "test"), CONFIG, "", "another digest")
+    assert kept and not evaluation._is_answered(out, other)
+
+
+def test_overwrite_asks_again(cloth_dataset: Path, tmp_path: Path) -> None:
+    out = tmp_path / "centre.parquet"
+    out.write_bytes(b"stale")
+    evaluate_baseline("centre", cloth_dataset, CONFIG, out, overwrite=True, progress=False)
+    assert len(load_queries(out)) == 15
+    assert list(tmp_path.iterdir()) == [out]
+
+
+def test_points_spread_evenly() -> None:
+    assert choose_points(5, 625).tolist() == [0, 156, 312, 468, 624]
+    assert choose_points(625, 625).tolist() == list(range(625))
+    assert choose_points(1, 625).tolist() == [0]
+
+
+@pytest.mark.parametrize("count", range(1, 626, 39))
+def test_as_many_points_as_asked_for(count: int) -> None:
+    assert len(choose_points(count, 625)) == count
+
+
+def test_summary_separates_visible_sources(tmp_path: Path) -> None:
+    shares = dict.fromkeys(["pck@5px", "pck@10px", "pck@20px"], 1.0)
+    others = {"nearest_px": 1.0, "best_px": 1.0, "swapped": 0.0, **shares}
+    table = pd.DataFrame({"visible": [True, True, False], "rmse_px": [1.0, 3.0, 8.0], **others})
+    table.to_parquet(tmp_path / "mmgsd.parquet")
+    summary = summarise({"mmgsd": tmp_path / "mmgsd.parquet"})["mmgsd"]
+    assert (summary["rmse_mean"], summary["queries"]) == (2.0, 2)
+    assert (summary["rmse_mean_all"], summary["queries_all"]) == (4.0, 3)
+
+
+def test_results_are_json(tmp_path: Path) -> None:
+    path = write_results({"cloth": {"mmgsd": {"rmse_mean": 1.5}}}, tmp_path / "new" / "rmse.json")
+    assert json.loads(path.read_text()) == {"cloth": {"mmgsd": {"rmse_mean": 1.5}}}
+    assert list(path.parent.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("method", ["pcl", "spcl"])
+def test_calibration_picks_a_candidate(cloth_dataset: Path, method: str) -> None:
+    torch.manual_seed(0)
+    config = TrainConfig(input_px=64, descriptor_dim=4, method=method, margin=0.6)
+    matcher = Matcher(build_network("lite0", 4, pretrained=False), config, modes=4, size=(485, 485), device="cpu")
+    bandwidth = calibrate_bandwidth(matcher, load_dataset(cloth_dataset), pairs=2, points=5)
+    assert bandwidth == matcher.bandwidth
+    assert bandwidth in [pytest.approx(0.6 * b) for b in BANDWIDTHS]
+
+
+def test_the_validation_error_is_that_of_the_queries(ask_oracle: object, cloth_dataset: Path) -> None:
+    ask_oracle(shift=7.0)  # from now on every model answers 7 px beside the truth
+    matcher = SimpleNamespace(config=TrainConfig())
+    assert measure_rmse(matcher, load_dataset(cloth_dataset), pairs=3, points=CONFIG.points) == pytest.approx(7, 1e-5)
+
+
+def test_modes_are_read_as_round_as_the_training_says(cloth_dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = TrainConfig(input_px=64, descriptor_dim=4, roundness=0.07)
+    matcher = Matcher(build_network("lite0", 4, pretrained=False), config, modes=4, size=(485, 485), device="cpu")
+    asked, read = [], evaluation.read_heatmap
+
+    def listen(*arguments: object, roundness: float) -> tuple[Mixture, torch.Tensor]:
+        asked.append(roundness)
+        return read(*arguments, roundness=roundness)
+
+    monkeypatch.setattr(evaluation, "read_heatmap", listen)
+    measure_rmse(matcher, load_dataset(cloth_dataset), pairs=2, points=5)
+    assert asked == [0.07, 0.07]
+
+
+def test_temperature_of_overconfident_and_timid_heatmaps(cloth_dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Heatmaps are Gaussians of 20 px around points that are off the truth by a Gaussian of another std."""
+    data, truth = load_dataset(cloth_dataset), {}
+    config = TrainConfig(input_px=64, descriptor_dim=4, group="identity")
+    matcher = Matcher(build_network("lite0", 4, pretrained=False), config, modes=1, size=(485, 485), device="cpu")
+    xs, ys = compute_cell_centres((485, 485), (97, 97))
+
+    def compute_heatmaps(first: None, second: int, xy: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
+        centre = torch.from_numpy(data.xy[second, choose_points(40, 625)]) + truth["offset"]
+        squared = (xs[None, None] - centre[:, :1, None]) ** 2 + (ys[None, :, None] - centre[:, 1:, None]) ** 2
+        logits = -squared / (2 * 20.0**2) / matcher.temperature
+        return logits.flatten(1).softmax(-1).view(-1, 97, 97)
+
+    monkeypatch.setattr(matcher, "compute_heatmaps", compute_heatmaps)
+    monkeypatch.setattr(evaluation, "_describe", lambda matcher, data, images: {int(i): int(i) for i in images})
+    for std, temperature in ((10.0, 0.25), (20.0, 1.0), (40.0, 4.0)):
+        truth["offset"] = std * torch.randn(40, 2, generator=torch.Generator().manual_seed(0))
+        truth["offset"] *= std / truth["offset"].square().mean().sqrt()
+        assert calibrate_temperature(matcher, data, pairs=8) == pytest.approx(temperature, rel=0.05)
+        assert matcher.temperature == pytest.approx(temperature, rel=0.05)
+
+
+@pytest.fixture
+def untrained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """What stands for the weights of an untrained network."""
+    config = dataclasses.replace(TrainConfig(), input_px=64, descriptor_dim=4)
+    matcher = Matcher(build_network("lite0", 4, pretrained=False), config, modes=4, size=(485, 485), device="cpu")
+    monkeypatch.setattr(evaluation.Matcher, "load", lambda path: matcher)
+    return write_weights(tmp_path)
+
+
+def test_a_model_answers_every_query(cloth_dataset: Path, tmp_path: Path, untrained: Path) -> None:
+    queries = load_queries(
+        evaluate_model(untrained, cloth_dataset, CONFIG, tmp_path / "mmgsd.parquet", group="d4", progress=False)
+    )
+    assert np.isfinite(queries.rmse_px).all()
+    assert queries[queries["pair"] == 0].n.tolist() == [4, 4, 1, 4, 4]  # points of a diagonal under d4
+
+
+def test_of_further_modes_the_most_probable_one_is_the_answer(
+    cloth_dataset: Path, tmp_path: Path, untrained: Path
+) -> None:
+    def ask(name: str, **how: object) -> pd.DataFrame:
+        out = tmp_path / f"{name}.parquet"
+        return load_queries(evaluate_model(untrained, cloth_dataset, CONFIG, out, progress=False, **how))
+
+    own, every = ask("own", group="identity", modes=4), ask("all", group="c4", modes=4)
+    assert (own.n == 1).all() and np.allclose(own.rmse_px, own.nearest_px)
+    assert (own.nearest_px >= every.nearest_px - 1e-6).all() and (own.nearest_px > every.nearest_px).any()
+    assert not np.allclose(own.rmse_px, ask("mean", group="identity").rmse_px)
+    with pytest.raises(ValueError, match="modes must be at least 0, got -1"):
+        ask("own", modes=-1)
+
+
+def test_a_point_that_sticks_out_of_the_image_is_asked_at_its_border(cloth_dataset: Path) -> None:
+    answer = evaluation._classical_answer("sift", load_dataset(cloth_dataset, "test"))
+    xy, four = np.float32([[-2.5, 120], [-0.5, 120]]), np.array([4, 4])
+    outside, border = answer(0, 1, xy, four)[0].modes
+    torch.testing.assert_close(outside, border)
+
+
+def test_weights_of_another_object_are_refused(cloth_dataset: Path, tmp_path: Path, untrained: Path) -> None:
+    matcher = evaluation.Matcher.load(untrained)
+    matcher.object = "rope"
+    with pytest.raises(ValueError, match="weights must be of the object 'cloth' of .*, got weights of 'rope'"):
+        evaluate_model(untrained, cloth_dataset, CONFIG, tmp_path / "out.parquet", progress=False)
+    assert not (tmp_path / "out.parquet").exists()
+    matcher.object = ""  # unknown
+    evaluate_model(untrained, cloth_dataset, CONFIG, tmp_path / "out.parquet", progress=False)
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        ({"temperature": -1.0}, "temperature must be finite and greater than 0, got -1.0"),
+        ({"temperature": float("nan")}, "temperature must be finite and greater than 0, got nan"),
+        ({"modes": 10**6}, "modes must be an integer from 1 to 64, got 1000000"),
+    ],
+)
+def test_what_cannot_be_asked(cloth_dataset: Path, tmp_path: Path, untrained: Path, asked: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        evaluate_model(untrained, cloth_dataset, CONFIG, tmp_path / "out.parquet", progress=False, **asked)

@@ -1,0 +1,108 @@
+"""What the figures are drawn from: kept, read back, and chosen by rule."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from mmgsd.dataset import load_dataset
+from mmgsd.match.matcher import Match, Matcher
+from mmgsd.measure.figure_data import (
+    FigureData,
+    choose_example,
+    gather_figure_data,
+    keep_stored,
+    load_figure_data,
+    save_figure_data,
+)
+from mmgsd.measure.metrics import ErrorSummary, summarise_errors
+
+
+def make_queries(errors: list[float], visible: list[bool]) -> pd.DataFrame:
+    """Four pairs of images asked about the points 3 and 7."""
+    pair = np.repeat(np.arange(4), 2)
+    table = {"pair": pair, "image0": pair, "image1": pair + 10, "point": np.tile([3, 7], 4)}
+    return pd.DataFrame({**table, "visible": visible, "rmse_px": errors})
+
+
+QUERIES = make_queries([1.01, 3.0, 9.0, 9.0, 5.0, 6.0, 0.0, 8000.0], [True] * 6 + [True, False])
+
+
+def answer_by_rote(self: None, image0: np.ndarray, image1: np.ndarray, xy: np.ndarray) -> Match:
+    """A match whose numbers are known, in place of a network's."""
+    count = len(xy)
+    covariances = np.tile(np.eye(2), (count, 4, 1, 1))
+    weights, nothing = np.full((count, 4), 0.25), np.zeros(count)
+    return Match(image0, image1, xy, np.ones((count, 4, 2)), weights, covariances, nothing, nothing,
+                 np.full((count, 5, 5), 0.04, np.float32))  # fmt: skip
+
+
+def test_the_example_is_the_median_of_the_pairs_that_show_the_points() -> None:
+    assert choose_example(QUERIES, [3, 7]) == (2, 12)  # means 2, 5.5 and 9; the fourth pair hides a point
+    assert choose_example(QUERIES, [3]) == (2, 12)  # 0, 1.01, 5 and 9
+
+
+@pytest.fixture
+def gathered(cloth_dataset: Path, monkeypatch: pytest.MonkeyPatch) -> FigureData:
+    """Figure data of two methods, one of them a model."""
+    monkeypatch.setattr(Matcher, "load", lambda path: Matcher.__new__(Matcher))
+    monkeypatch.setattr(Matcher, "match", answer_by_rote)
+    queries = QUERIES.assign(image0=0, image1=2)
+    tables = {"mmgsd": queries, "sift": queries.assign(rmse_px=7.3)}
+    return gather_figure_data(tables, {"mmgsd": Path("any")}, load_dataset(cloth_dataset, "test"), points=[3, 7])
+
+
+def test_gathering_asks_the_models_about_the_example(gathered: FigureData, cloth_dataset: Path) -> None:
+    data = load_dataset(cloth_dataset, "test")
+    np.testing.assert_array_equal(gathered.answers["mmgsd"].xy, data.xy[0, [3, 7]])
+    np.testing.assert_array_equal(gathered.true, data.xy[2, data.group().distinct_modes(3)])
+    assert 240 < gathered.object_size_px < 2 * 240  # of a square of 240 px, turned by any angle
+
+
+def test_kept_and_read_back(gathered: FigureData, tmp_path: Path) -> None:
+    back = load_figure_data(save_figure_data(gathered, tmp_path / "kept" / "cloth.safetensors"))
+    assert list(back.errors) == ["mmgsd", "sift"]
+    assert back.object_size_px == gathered.object_size_px
+    for method, summary in back.errors.items():
+        before = gathered.errors[method]
+        for field in dataclasses.fields(ErrorSummary):
+            np.testing.assert_array_equal(getattr(summary, field.name), getattr(before, field.name))
+    before, after = gathered.answers["mmgsd"], back.answers["mmgsd"]
+    for field in dataclasses.fields(Match):
+        apart = np.abs(getattr(after, field.name).astype(float) - getattr(before, field.name))
+        assert apart.mean() < (6 if field.name.startswith("image") else 1e-6)  # JPEG
+    np.testing.assert_array_equal(back.true, gathered.true)
+
+
+def test_answers_of_another_machine_are_kept_where_questions_are_the_same(gathered: FigureData, tmp_path: Path) -> None:
+    ours, answer, path = gathered.errors["mmgsd"], gathered.answers["mmgsd"], tmp_path / "cloth.safetensors"
+    assert keep_stored(gathered, path, ["pcl"]) is gathered  # nothing is there
+    theirs = {name: dataclasses.replace(ours, mean_px=ours.mean_px + 1) for name in ("pcl", "mmgsd", "old")}
+    stored = dataclasses.replace(gathered, errors=theirs, answers=dict.fromkeys(("pcl", "mmgsd"), answer))
+    save_figure_data(stored, path)
+    both = keep_stored(gathered, path, ["pcl", "mmgsd", "sift"])
+    assert set(both.errors) == {"pcl", "mmgsd", "sift"} and set(both.answers) == {"pcl", "mmgsd"}
+    assert both.errors["mmgsd"] is ours
+    np.testing.assert_array_equal(both.errors["pcl"].mean_px, theirs["pcl"].mean_px)
+    example = keep_stored(dataclasses.replace(gathered, true=gathered.true + 1), path, ["pcl"])
+    assert set(example.errors) == {"pcl", "mmgsd", "sift"} and set(example.answers) == {"mmgsd"}
+    fewer = {method: dataclasses.replace(row, asked=row.asked - 1) for method, row in gathered.errors.items()}
+    assert set(keep_stored(dataclasses.replace(gathered, errors=fewer), path, ["pcl"]).errors) == {"mmgsd", "sift"}
+
+
+def test_other_queries_are_refused(gathered: FigureData, tmp_path: Path) -> None:
+    gathered.errors["sift"] = summarise_errors(QUERIES.assign(point=5))
+    with pytest.raises(ValueError, match=r"errors\['sift'\] must answer the same queries"):
+        save_figure_data(gathered, tmp_path / "cloth.safetensors")
+
+
+def test_a_missing_or_damaged_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="04_evaluate"):
+        load_figure_data(tmp_path / "cloth.safetensors")
+    (tmp_path / "cloth.safetensors").write_bytes(b"0123456789")
+    with pytest.raises(ValueError, match="does not hold the data of figures"):
+        load_figure_data(tmp_path / "cloth.safetensors")

@@ -1,0 +1,143 @@
+"""Workspaces: labels know what covers the object, cameras keep it in the picture, nothing of a view stays."""
+
+import json
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.ndimage import distance_transform_edt
+
+bpy = pytest.importorskip("bpy")
+
+from mmgsd.config import RenderConfig, find_root  # noqa: E402
+from mmgsd.scene import cloth, grounds, materials, prints, render, solids, things, workspace  # noqa: E402
+from mmgsd.scene.episode import render_episode  # noqa: E402
+from mmgsd.scene.render import DeformedObject  # noqa: E402
+from mmgsd.scene.sheet import load_sheet  # noqa: E402
+
+SIZE = (485, 485)
+FLAT = DeformedObject(None, cloth.flat_vertices()[::7], cloth.VISIBILITY_RADIUS, {})
+
+
+def render_views(name: str, views: int, episode: int = 0) -> list[render.View]:
+    own = name not in ("cloth", "rope")
+    sheet = load_sheet(find_root() / "data" / "objects" / f"{name}.json") if own else None
+    config = RenderConfig(object=name, train_images=1, test_images=1, views=1, scene="workspace")
+    return render_episode(config, "train", episode, views, sheet)
+
+
+@pytest.mark.parametrize("name", ["cloth", "rope", "tshirt"])
+def test_visible_points_lie_in_the_mask_whatever_covers_the_object(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(things, "OVER_COUNTS", (0.0, 0.0, 1.0))
+    for view in render_views(name, 3):
+        assert view.info["present"] == view.mask.any() == view.visible.any()
+        x, y = np.rint(view.xy[view.visible]).astype(int).T
+        assert np.mean(distance_transform_edt(~view.mask)[y, x] <= 2) > 0.98
+
+
+def test_without_the_object_nothing_is_visible_and_the_mask_is_empty(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workspace, "ABSENT", 1.0)
+    monkeypatch.setattr(grounds, "KINDS", {"floor": 1.0})
+    absent, = render_views("rope", 1)
+    assert not absent.mask.any() and not absent.visible.any() and absent.info["present"] is False
+    assert np.isfinite(absent.xy).all() and absent.image.std() > 1
+
+
+def test_the_same_arguments_give_the_same_pixels_in_any_process(tmp_path: Path) -> None:
+    archives = []
+    for threads in ("1", "2"):
+        config = {"object": "rope", "scene": "workspace"}
+        job = {"config": config, "split": "test", "episodes": [[1, 2]], "out": str(tmp_path / threads)}
+        environment = {**os.environ, "MMGSD_THREADS": threads}
+        command = [sys.executable, "-m", "mmgsd.scene"]
+        subprocess.run(command, input=json.dumps(job), text=True, check=True, env=environment)
+        archives.append((tmp_path / threads).read_bytes())
+    assert archives[0] == archives[1]
+    labels = json.loads(zipfile.ZipFile(tmp_path / "1").read("labels.json"))
+    assert {"present", "things", "light", "tilt_deg"} <= set(labels[0]["info"])
+
+
+@pytest.mark.parametrize("limit", [45.0, 180.0])
+def test_the_object_is_in_the_picture_however_the_camera_tilts(limit: float) -> None:
+    rng, tilts, fills = np.random.default_rng(0), [], []
+    for _ in range(80):
+        camera, turn, tilt = workspace.draw_camera(rng, FLAT, SIZE, limit)
+        xy = camera.project(FLAT.points)
+        assert camera.contains(xy).mean() >= 1 - workspace.MAX_OUTSIDE and abs(np.degrees(turn)) <= limit
+        down = np.degrees(np.arccos(-camera.pose[2, 2]))
+        assert down == pytest.approx(tilt, abs=1e-3) and tilt <= workspace.MAX_TILT_DEG
+        tilts.append(tilt)
+        fills.append(np.ptp(xy, axis=0).max() / SIZE[0])
+    assert max(tilts) > 35 and min(fills) < 0.4 and max(fills) > 0.9
+
+
+def test_points_behind_a_thing_are_covered_and_the_others_are_not() -> None:
+    camera = workspace._frame(np.random.default_rng(0), FLAT.points, SIZE, 0.0, 0.0, 0.8, 3.0)
+    box = solids.make_box((0.3, 0.3, 0.02), (0.2, 0.2, 0.1))
+    covered = things.find_covered([box], FLAT.points, camera)
+    apart = np.abs(FLAT.points[:, :2] - 0.2).max(axis=1)
+    assert covered[apart < 0.1].all() and not covered[apart > 0.25].any()
+    assert not things.find_covered([], FLAT.points, camera).any()
+
+
+def test_things_leave_at_least_half_of_the_object_to_be_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(things, "OVER_COUNTS", (0.0, 0.0, 1.0))
+    camera = workspace._frame(np.random.default_rng(0), FLAT.points, SIZE, 0.0, 20.0, 0.8, 3.0)
+    seen = np.ones(len(FLAT.points), dtype=bool)
+    site = grounds.Site(FLAT.points, 1.0, 0.0, np.random.default_rng(1).uniform(-2, 2, (60, 2)), (9, 9, 9), 0.0, False)
+    hidden = []
+    for seed in range(12):
+        render.reset_scene()
+        left, _ = things.add_things(np.random.default_rng(seed), site, camera, seen, beside=True, walls=[])
+        hidden.append(1 - left.mean())
+    assert max(hidden) <= things.MOST_HIDDEN and np.mean(np.array(hidden) > 0.01) > 0.5
+
+
+def test_a_rope_has_no_cords_beside_it() -> None:
+    site = grounds.Site(FLAT.points, 1.0, 0.0, np.zeros((1, 2)), (9, 9, 9), 0.01, True)
+    names = {name for seed in range(200) for name, *_ in things._choose(np.random.default_rng(seed), site, True)}
+    assert "cord" not in names and {"mug", "textile", "gripper", "hand"} <= names
+
+
+def test_things_cast_shadows() -> None:
+    """A sun from the side: the floor is dark on one side of a box, and light on the other."""
+    scene = render.reset_scene()
+    render.setup_cycles(scene, SIZE, 4)
+    grounds._add_floor(materials.paint_plain(np.random.default_rng(0), (250, 250, 250)), 0.0)
+    box = solids.make_box((0.2, 0.2, 0.3), (0, 0, 0.15))
+    grounds.add_solid(box, materials.paint_plain(np.random.default_rng(0), (250, 250, 250)))
+    render.place_camera(scene, workspace._frame(np.random.default_rng(0), FLAT.points, SIZE, 0.0, 0.0, 1.0, 3.0))
+    workspace.randomize.set_world(scene, (1.0, 1.0, 1.0, 1.0), 0.1)
+    lamp = workspace.randomize.new_lamp(scene, "SUN")
+    lamp.data.energy, lamp.rotation_euler = 3.0, (0.0, np.radians(50), 0.0)  # from +x
+    image, _ = render.render_image(scene, seed=0)
+    row = image[SIZE[1] // 2].mean(axis=1)
+    assert row[360] > 2 * row[130]
+
+
+@pytest.mark.parametrize("name", [*prints.PICTURES, *prints.FABRICS])
+def test_every_picture_is_a_picture(name: str, rng: np.random.Generator) -> None:
+    paint = (prints.PICTURES | prints.FABRICS)[name]
+    image = np.asarray(paint(rng, (120, 40, 200)))
+    assert image.shape == (prints.SIDE, prints.SIDE, 3) and image.dtype == np.uint8
+
+
+@pytest.mark.parametrize("name", [*things.BESIDE, *things.OVER])
+def test_every_thing_stands_on_the_table_and_is_closed_to_rays(name: str, rng: np.random.Generator) -> None:
+    for _ in range(5):
+        for solid, _, _ in (things.BESIDE | things.OVER)[name](rng):
+            assert np.isfinite(solid.vertices).all() and solid.faces.max() < len(solid.vertices)
+            assert solid.vertices[:, 2].min() > -0.05
+
+
+def test_nothing_of_a_view_stays_but_its_pictures_until_the_episode_ends() -> None:
+    render_views("rope", 2)
+    materials.remove_view()
+    kinds = (bpy.data.objects, bpy.data.meshes, bpy.data.materials)
+    assert not [block.name for kind in kinds for block in kind if block.name.startswith(materials.PREFIX)]
+    render.reset_scene()
+    assert not len(bpy.data.images)
