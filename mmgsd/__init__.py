@@ -4,7 +4,7 @@ import importlib
 from typing import Any
 
 __version__ = "0.1.0"
-_PLACES = {"Matcher": "matching", "load": "matching", "read_image": "images"}
+_PLACES = {"Matcher": "match.matcher", "load": "match.matcher", "read_image": "images"}
 __all__ = ["Matcher", "load", "read_image"]
 
 
