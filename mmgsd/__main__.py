@@ -1,4 +1,4 @@
-"""The command line: ``python -m mmgsd match``, ``python -m mmgsd export``."""
+"""The command line: ``python -m mmgsd match``, ``export``, ``calibrate``, ``heads``."""
 
 from __future__ import annotations
 
@@ -27,9 +27,11 @@ def main(arguments: list[str] | None = None) -> None:
     parser = make_parser()
     asked = parser.parse_args(arguments)
     try:
-        {"match": _match, "export": _export}[asked.command](asked)
+        commands = {"match": _match, "export": _export, "calibrate": _calibrate, "heads": _heads}
+        commands[asked.command](asked)
     except KeyboardInterrupt:
-        kept = f"{asked.out} is as it was before" if asked.out else "there was nothing to keep"
+        out = getattr(asked, "out", None)
+        kept = f"{out} is as it was before" if out else "there was nothing to keep"
         parser.exit(130, f"stopped: {kept}\n")
     except BrokenPipeError:  # who reads the output has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -61,7 +63,35 @@ def make_parser() -> argparse.ArgumentParser:
     for command in (match, export):
         command.add_argument("--weights", required=True, metavar="FILE",
                              help="a trained model (safetensors), or a name in data/weights, like cloth")  # fmt: skip
+    _add_measures(commands)
     return parser
+
+
+def _add_measures(commands: Any) -> None:
+    """The commands that need a data set."""
+    calibrate = commands.add_parser("calibrate", help="fit what ellipses, radii and confidences promise, and keep it")
+    calibrate.add_argument("--overwrite", action="store_true", help="fit it anew where the weights have it")
+    heads = commands.add_parser("heads", help="measure the masks, hidden matches and absence that weights tell")
+    heads.add_argument("--out", type=Path, required=True, metavar="FILE", help="the results to write (JSON)")
+    for command in (calibrate, heads):
+        command.add_argument("weights", type=Path, help="a trained model (safetensors)")
+        command.add_argument("--data", type=Path, required=True, metavar="FOLDER", help="the data set trained on")
+
+
+def _calibrate(asked: argparse.Namespace) -> None:
+    from mmgsd.measure.calibration import calibrate_weights
+
+    found = mmgsd.load(calibrate_weights(asked.weights, asked.data, overwrite=asked.overwrite)).calibration
+    print(f"{asked.weights}: calibrated on {found.pairs} pairs of held-out simulations; each half of them, by the other, "
+          f"has an error of {found.ece_ellipse:.3f} of ellipses and {found.ece_confidence:.3f} of confidences")  # fmt: skip
+
+
+def _heads(asked: argparse.Namespace) -> None:
+    from mmgsd.config import EvaluateConfig
+    from mmgsd.files import read_json
+    from mmgsd.measure.heads import evaluate_heads
+
+    print(json.dumps(read_json(evaluate_heads(asked.weights, asked.data, EvaluateConfig(pairs=100), asked.out))))
 
 
 def _match(asked: argparse.Namespace) -> None:

@@ -246,7 +246,7 @@ def prepare_baseline(matcher: BaselineMatcher, scene: Scene) -> Callable[[np.nda
         back = {
             "modes": (found.modes + 0.5) * ratio1 - 0.5,
             "covariances": found.covariances * np.outer(ratio1, ratio1),
-            "entropy": found.entropy + np.log(ratio1.prod()),
+            "scale": float(np.sqrt(ratio1.prod())),  # to the entropy and the confidence, the size is no matter
         }
         return dataclasses.replace(found, image0=scene.image0, image1=scene.image1, xy=xy, **back)
 

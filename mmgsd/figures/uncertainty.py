@@ -43,9 +43,9 @@ def plot_risk_coverage(queries: Tables) -> Figure:
 
 @styled
 def plot_calibration(before: Tables, after: Tables) -> Figure:
-    """Share of true matches inside the ellipses against the share a Gaussian has there; grey: perfectly calibrated.
+    """Share of true matches inside the ellipses against the share that they promise; grey: perfectly calibrated.
 
-    ``before`` (thin, dashed) and ``after`` (solid) the temperature's calibration, {object: {method: table}} of the same
+    ``before`` (thin, dashed) and ``after`` (solid) the calibration, {object: {method: table}} of the same
     objects; a method in one of them only has that line only. ValueError for other objects, or none.
     """
     if list(before) != list(after):
@@ -53,18 +53,47 @@ def plot_calibration(before: Tables, after: Tables) -> Figure:
     figure, axes = _make_panels("before", before)
     for axis, name in zip(axes, before, strict=True):
         check_filled(f"after[{name!r}]", after[name])
-        axis.plot([0, 100], [0, 100], color="0.75", lw=0.8, zorder=1)
+        _draw_diagonal(axis, name, "Expected coverage (%)")
         for method in _sort_methods(after[name]):
             _draw_coverage(axis, after[name][method], get_line_style(method))
         for method in _sort_methods(before[name]):
             label = "" if method in after[name] else get_line_style(method)["label"]
             _draw_coverage(axis, before[name][method], get_line_style(method) | _THIN | {"label": label})
-        axis.set(title=name.capitalize(), xlabel="Expected coverage (%)", xlim=(0, 100), ylim=(0, 100), aspect="equal",
-                 xticks=range(0, 101, 25), yticks=range(0, 101, 25))  # fmt: skip
     axes[0].set_ylabel("Observed coverage (%)")
     axes[0].plot([], [], color="0.3", label="Before calibration", **_THIN)
     add_legend(figure, axes)
     return finish_axes(figure)
+
+
+@styled
+def plot_reliability(before: Mapping[str, pd.DataFrame], after: Mapping[str, pd.DataFrame]) -> Figure:
+    """Reliability diagram: how often a match is near a mode, against the confidence that it is; grey: calibrated.
+
+    ``before`` (rings) and ``after`` (dots with 95 % intervals) the calibration, {object: rows} of the same objects by
+    `mmgsd.measure.uncertainty.compute_reliability`. ValueError for other objects, or none.
+    """
+    check_filled("before", before)
+    if list(before) != list(after):
+        raise ValueError(f"before and after must have the same objects, got {list(before)} and {list(after)}")
+    figure, axes = _make_row(len(before))
+    style = get_line_style("mmgsd")
+    for axis, name in zip(axes, before, strict=True):
+        _draw_diagonal(axis, name, "Confidence (%)")
+        axis.plot(100 * before[name].expected, 100 * before[name].observed, "o", ms=3.5, mfc="white", mec="0.45",
+                  mew=0.8, ls=_THIN["linestyle"], lw=_THIN["linewidth"], c="0.45", label="Gaussian")  # fmt: skip
+        rows = 100 * after[name][["expected", "observed", "margin"]]
+        axis.errorbar(rows.expected, rows.observed, rows.margin, fmt="o-", ms=3.5, lw=1, elinewidth=0.8,
+                      color=style["color"], label="Calibrated", zorder=style["zorder"])  # fmt: skip
+    axes[0].set_ylabel("A match is near (%)")
+    add_legend(figure, axes)
+    return finish_axes(figure)
+
+
+def _draw_diagonal(axis: Axes, name: str, promised: str) -> None:
+    """Axes in % and the line of what keeps its promise."""
+    axis.plot([0, 100], [0, 100], color="0.75", lw=0.8, zorder=1)
+    axis.set(title=name.capitalize(), xlabel=promised, xlim=(0, 100), ylim=(0, 100), aspect="equal",
+             xticks=range(0, 101, 25), yticks=range(0, 101, 25))  # fmt: skip
 
 
 def _make_panels(name: str, tables: Tables) -> tuple[Figure, np.ndarray]:
@@ -72,7 +101,11 @@ def _make_panels(name: str, tables: Tables) -> tuple[Figure, np.ndarray]:
     check_filled(name, tables)
     for key, methods in tables.items():
         check_filled(f"{name}[{key!r}]", methods)
-    figure, axes = plt.subplots(1, len(tables), figsize=(COLUMN_IN, 2.2), layout="constrained", squeeze=False)
+    return _make_row(len(tables))
+
+
+def _make_row(count: int) -> tuple[Figure, np.ndarray]:
+    figure, axes = plt.subplots(1, count, figsize=(COLUMN_IN, 2.2), layout="constrained", squeeze=False)
     figure.get_layout_engine().set(h_pad=0.04)  # the legend keeps its distance from the axes' labels
     return figure, axes[0]
 

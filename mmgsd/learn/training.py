@@ -43,7 +43,8 @@ from mmgsd.learn.objective import compute_head_loss, compute_loss
 from mmgsd.learn.optimiser import make_optimisers
 from mmgsd.learn.prototypes import compute_prototype_loss, make_prototypes
 from mmgsd.match.matcher import Matcher, load
-from mmgsd.measure.evaluation import calibrate_bandwidth, calibrate_temperature, measure_rmse
+from mmgsd.measure.calibration import calibrate_bandwidth, calibrate_modes, calibrate_temperature
+from mmgsd.measure.questions import measure_rmse
 
 PROTOTYPE_EVERY = 4  # each step asks every so many material points
 CHECKPOINT_SECONDS = 60.0  # of training between two checkpoints
@@ -283,6 +284,9 @@ class _Run:
         if matcher.bandwidth is not None:
             metadata["bandwidth"] = repr(matcher.bandwidth)
         metadata["temperature"] = repr(calibrate_temperature(matcher, self.held_out))
+        calibration = calibrate_modes(matcher, self.held_out)
+        if calibration is not None:
+            metadata["calibration"] = calibration.to_json()
         write_tensors(weights, self.average.module.state_dict(), metadata)
         (self.folder / CHECKPOINT).unlink(missing_ok=True)
         return weights

@@ -19,6 +19,7 @@ from mmgsd.images import read_image as read_image
 from mmgsd.learn.heads import Outputs, look_up, weigh_cells
 from mmgsd.learn.losses import compute_squared_distances
 from mmgsd.learn.network import compute_cell_centres, find_device, fit_input_size, sample_descriptors
+from mmgsd.match.calibration import Calibration
 from mmgsd.match.match import Best as Best
 from mmgsd.match.match import Match
 from mmgsd.match.mixture import Mixture, check_count, check_modes, fit_modes, keep_most_probable
@@ -62,7 +63,7 @@ class Matcher:
 
     def __init__(
         self, network: torch.nn.Module, config: TrainConfig, *, modes: int, size: tuple[int, int], device: str = "",
-        bandwidth: float | None = None, temperature: float = 1.0,
+        bandwidth: float | None = None, temperature: float = 1.0, calibration: Calibration | None = None,
     ) -> None:  # fmt: skip
         check_scales(bandwidth=bandwidth, temperature=temperature)
         check_modes(modes)
@@ -71,7 +72,7 @@ class Matcher:
         self.network = network.eval().to(self.device, memory_format=torch.channels_last)
         self.config, self.modes, self.size = config, modes, size
         self.object = config.object  # "" where a file of weights does not say
-        self.temperature = temperature
+        self.temperature, self.calibration = temperature, calibration
         self.turns = QUARTERS if config.rotate else 1  # what was trained upright knows only upright images
         self.bandwidth = config.margin / 4 if bandwidth is None and config.method in CONTRASTIVE else bandwidth
 
@@ -219,8 +220,10 @@ class Pair:
         cells = self.matcher.compute_heatmaps(*self.said, torch.from_numpy(points), size0, mask1=mask1)
         centres = compute_cell_centres(size1, cells.shape[-2:])
         fitted, roundness = self.matcher.modes, self.matcher.config.roundness
-        match = make_match(self.image0, self.image1, points, cells, centres, n, fitted=fitted, roundness=roundness)
-        return dataclasses.replace(match, **self._look(match, sizes))
+        scale = compute_scale(size1, self.matcher.size)
+        match = make_match(self.image0, self.image1, points, cells, centres, n, fitted=fitted, roundness=roundness,
+                           scale=scale)  # fmt: skip
+        return dataclasses.replace(match, calibration=self.matcher.calibration, **self._look(match, sizes))
 
     def _look(self, match: Match, sizes: tuple[tuple[int, int], ...]) -> dict[str, np.ndarray]:
         """What is known of the object's presence: ``visible``, ``on_object`` and ``absent`` of a match."""
@@ -253,18 +256,28 @@ def load(weights: Path | str, *, device: str = "") -> Matcher:
 
 def make_match(
     image0: np.ndarray, image1: np.ndarray, xy: np.ndarray, cells: Tensor, centres: tuple[Tensor, Tensor], n: Any, *,
-    fitted: int = 1, roundness: float = ROUNDNESS,
+    fitted: int = 1, roundness: float = ROUNDNESS, scale: float = 1.0,
 ) -> Match:  # fmt: skip
     """The answer that heatmaps (S, h, w) with cell ``centres`` (w,), (h,) px hold, however they were made.
 
-    At least ``fitted`` modes are fitted, of which the ``n`` most probable are returned; None: as many.
+    At least ``fitted`` modes are fitted, of which the ``n`` most probable are returned; None: as many. ``scale`` is
+    `compute_scale`'s, for an entropy that does not depend on the number of image1's pixels.
     """
     wanted = check_count(fitted if n is None else n, "n", queries=len(cells))
     fit, entropy = read_heatmap(cells, "auto" if wanted is None else wanted.clamp(min=fitted), centres,
                                 roundness=roundness)  # fmt: skip
     fit = fit if wanted is None else keep_most_probable(fit, wanted)
     arrays = (t.cpu().numpy() for t in (fit.modes, fit.weights, fit.covariances, entropy, fit.outside, cells))
-    return Match(image0, image1, xy, *arrays)
+    match = Match(image0, image1, xy, *arrays, scale=scale)
+    return dataclasses.replace(match, entropy=match.entropy - np.float32(2 * math.log(scale)))
+
+
+def compute_scale(size: tuple[int, int], trained: tuple[int, int]) -> float:
+    """px of an image of ``size`` by px of one that the model was ``trained`` with: the root of their areas' ratio.
+
+    As large as the network sees them: its inputs have as many pixels of one as of the other (`fit_input_size`).
+    """
+    return math.sqrt(size[0] * size[1] / (trained[0] * trained[1]))
 
 
 def read_heatmap(

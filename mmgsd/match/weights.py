@@ -13,6 +13,7 @@ from torch import Tensor
 
 from mmgsd.config import TrainConfig, from_dict
 from mmgsd.learn.network import build_network
+from mmgsd.match.calibration import parse_calibration
 
 FORMAT = "mmgsd-1"
 PICKLES = (b"PK\x03\x04", b"\x80")  # how PyTorch's own files begin
@@ -23,6 +24,7 @@ ACCEPTED = {  # what a value of the metadata must be
     "size": "[width, height] px",
     "bandwidth": "a number greater than 0",
     "temperature": "a number greater than 0",
+    "calibration": "what `python -m mmgsd calibrate` writes, tables of numbers that ascend",
 }
 
 
@@ -32,7 +34,7 @@ class Weights:
 
     network: torch.nn.Module
     config: TrainConfig
-    settings: dict[str, Any]  # modes, size, and where they are stored bandwidth and temperature
+    settings: dict[str, Any]  # modes, size, and where they are stored bandwidth, temperature, calibration
     object: str  # what was taught, "" where the file does not say
 
 
@@ -55,6 +57,8 @@ def read_weights(path: Path | str) -> Weights:
     config, known = _read_config(path, metadata)
     settings = {"modes": _read(path, metadata, "modes", int), "size": _read(path, metadata, "size", _parse_size)}
     settings |= {name: _read(path, metadata, name, float) for name in ("bandwidth", "temperature") if name in metadata}
+    if "calibration" in metadata:
+        settings["calibration"] = _read(path, metadata, "calibration", parse_calibration)
     return Weights(_make_network(path, config, state), config, settings, config.object if known else "")
 
 

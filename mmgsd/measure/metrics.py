@@ -10,8 +10,10 @@ import pandas as pd
 from scipy.optimize import linear_sum_assignment
 
 from mmgsd.config import N_POINTS
+from mmgsd.match.calibration import compute_share
 
 PCK_PX = (5, 10, 20)
+LISTS = ("mahalanobis2", "distance_px", "spread_px", "share")  # columns with n numbers a query
 BIN_PX = 0.5  # width of the bins of an error's histogram
 
 
@@ -65,6 +67,21 @@ def compute_mahalanobis2(modes: np.ndarray, covariances: np.ndarray, true: np.nd
     offset = true - np.take_along_axis(modes, assigned[..., None], 1)
     paired = np.take_along_axis(covariances, assigned[..., None, None], 1)
     return np.einsum("sni,snij,snj->sn", offset, np.linalg.inv(paired), offset)
+
+
+def compute_mode_lists(
+    modes: np.ndarray, covariances: np.ndarray, weights: np.ndarray, true: np.ndarray
+) -> dict[str, np.ndarray]:
+    """What a calibration needs of (S, n, 2) modes, most probable first: the columns `LISTS`, each value (S, n).
+
+    ``mahalanobis2`` from each mode of the true match paired with it, ``distance_px`` of the nearest one, ``spread_px``
+    and ``share`` of an equal mode's weight.
+    """
+    paired = np.take_along_axis(compute_mahalanobis2(modes, covariances, true), assign_modes(modes, true).argsort(1), 1)
+    distances = np.linalg.norm(true[:, None] - modes[:, :, None], axis=-1)  # (S, predicted, true)
+    spread = np.sqrt(np.trace(covariances, axis1=-2, axis2=-1) / 2)
+    values = paired, distances.min(-1), spread, compute_share(weights)
+    return dict(zip(LISTS, values, strict=True))
 
 
 def compute_query_errors(modes: np.ndarray, covariances: np.ndarray, true: np.ndarray) -> dict[str, np.ndarray]:

@@ -114,7 +114,7 @@ def test_the_heatmap_of_one_query_is_made_alone(five: Match) -> None:
 
 
 def test_an_answer_is_described_in_a_line(five: Match) -> None:
-    assert repr(five) == "Match(5 queries, up to 4 modes each, images of 485 x 485 px and 485 x 485 px)"
+    assert repr(five) == "Match(5 queries, up to 4 modes each, images of 485 x 485 px and 485 x 485 px, not calibrated)"
     assert repr(five[0]).startswith("Match(1 query, ")
 
 

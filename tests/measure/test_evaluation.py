@@ -14,23 +14,20 @@ import torch
 
 from mmgsd.config import EvaluateConfig, TrainConfig
 from mmgsd.dataset import Dataset, load_dataset
-from mmgsd.learn.network import build_network, compute_cell_centres
+from mmgsd.learn.network import build_network
 from mmgsd.match.matcher import Matcher
 from mmgsd.match.mixture import Mixture
-from mmgsd.measure import evaluation
+from mmgsd.measure import evaluation, questions
 from mmgsd.measure.evaluation import (
-    BANDWIDTHS,
     BASELINES,
-    calibrate_bandwidth,
-    calibrate_temperature,
-    choose_points,
     evaluate_baseline,
     evaluate_model,
     load_queries,
-    measure_rmse,
     summarise,
     write_results,
 )
+from mmgsd.measure.metrics import LISTS
+from mmgsd.measure.questions import choose_points, measure_rmse
 
 CONFIG = EvaluateConfig(pairs=3, points=5)
 CLOTH_SIDE_PX = 240.0  # of the synthetic cloths
@@ -50,7 +47,7 @@ def write_weights(folder: Path, content: bytes = b"weights") -> Path:
 def answer_with_the_truth(group: str, shift: float) -> object:
     """Stands for a model that knows the labels: the true modes, moved by ``shift`` px along x."""
 
-    def make(matcher: object, data: Dataset, config: EvaluateConfig) -> evaluation.Answer:
+    def make(matcher: object, data: Dataset, config: EvaluateConfig) -> questions.Answer:
         def answer(first: int, second: int, xy: np.ndarray, n: np.ndarray) -> tuple[Mixture, torch.Tensor]:
             modes = np.full((len(xy), n.max(), 2), np.nan)
             for row, point in enumerate(choose_points(CONFIG.points, 625)):
@@ -68,7 +65,8 @@ def answer_with_the_truth(group: str, shift: float) -> object:
 def ask_oracle(monkeypatch: pytest.MonkeyPatch, cloth_dataset: Path, tmp_path: Path) -> object:
     def ask(group: str = "", *, shift: float = 0.0) -> pd.DataFrame:
         monkeypatch.setattr(evaluation.Matcher, "load", lambda path: None)
-        monkeypatch.setattr(evaluation, "_model_answer", answer_with_the_truth(group, shift))
+        for module in (evaluation, questions):
+            monkeypatch.setattr(module, "model_answer", answer_with_the_truth(group, shift))
         out = tmp_path / f"oracle{group}.parquet"
         return load_queries(
             evaluate_model(write_weights(tmp_path), cloth_dataset, CONFIG, out, group=group, progress=False)
@@ -99,12 +97,12 @@ def test_coinciding_modes_are_merged(ask_oracle: object) -> None:
 def test_one_row_a_query(cloth_dataset: Path, tmp_path: Path) -> None:
     queries = ask_baseline("centre", cloth_dataset, tmp_path / "centre.parquet")
     assert list(queries.columns) == [
-        "pair", "image0", "image1", "point", "visible", "n", "entropy", "hidden", "outside", "mahalanobis2",
+        "pair", "image0", "image1", "point", "visible", "n", "entropy", "hidden", "outside", *LISTS,
         "rmse_px", "nearest_px", "best_px", "swapped", "pck@5px", "pck@10px", "pck@20px",
     ]  # fmt: skip
     assert len(queries) == CONFIG.pairs * CONFIG.points
     assert not queries.duplicated(["pair", "point"]).any()
-    unknown = ["visible", "outside", "mahalanobis2"]  # chance has no heatmap
+    unknown = ["visible", "outside", *LISTS]  # chance has no heatmap
     assert np.isfinite(queries.drop(columns=unknown).to_numpy(dtype=float)).all()
     assert queries.outside.isna().all()
     assert np.isnan(np.concatenate(queries.mahalanobis2)).all()
@@ -217,16 +215,6 @@ def test_results_are_json(tmp_path: Path) -> None:
     assert list(path.parent.iterdir()) == [path]
 
 
-@pytest.mark.parametrize("method", ["pcl", "spcl"])
-def test_calibration_picks_a_candidate(cloth_dataset: Path, method: str) -> None:
-    torch.manual_seed(0)
-    config = TrainConfig(input_px=64, descriptor_dim=4, method=method, margin=0.6)
-    matcher = Matcher(build_network("lite0", 4, pretrained=False), config, modes=4, size=(485, 485), device="cpu")
-    bandwidth = calibrate_bandwidth(matcher, load_dataset(cloth_dataset), pairs=2, points=5)
-    assert bandwidth == matcher.bandwidth
-    assert bandwidth in [pytest.approx(0.6 * b) for b in BANDWIDTHS]
-
-
 def test_the_validation_error_is_that_of_the_queries(ask_oracle: object, cloth_dataset: Path) -> None:
     ask_oracle(shift=7.0)  # from now on every model answers 7 px beside the truth
     matcher = SimpleNamespace(config=TrainConfig())
@@ -236,37 +224,15 @@ def test_the_validation_error_is_that_of_the_queries(ask_oracle: object, cloth_d
 def test_modes_are_read_as_round_as_the_training_says(cloth_dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config = TrainConfig(input_px=64, descriptor_dim=4, roundness=0.07)
     matcher = Matcher(build_network("lite0", 4, pretrained=False), config, modes=4, size=(485, 485), device="cpu")
-    asked, read = [], evaluation.read_heatmap
+    asked, read = [], questions.read_heatmap
 
     def listen(*arguments: object, roundness: float) -> tuple[Mixture, torch.Tensor]:
         asked.append(roundness)
         return read(*arguments, roundness=roundness)
 
-    monkeypatch.setattr(evaluation, "read_heatmap", listen)
+    monkeypatch.setattr(questions, "read_heatmap", listen)
     measure_rmse(matcher, load_dataset(cloth_dataset), pairs=2, points=5)
     assert asked == [0.07, 0.07]
-
-
-def test_temperature_of_overconfident_and_timid_heatmaps(cloth_dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Heatmaps are Gaussians of 20 px around points that are off the truth by a Gaussian of another std."""
-    data, truth = load_dataset(cloth_dataset), {}
-    config = TrainConfig(input_px=64, descriptor_dim=4, group="identity")
-    matcher = Matcher(build_network("lite0", 4, pretrained=False), config, modes=1, size=(485, 485), device="cpu")
-    xs, ys = compute_cell_centres((485, 485), (97, 97))
-
-    def compute_heatmaps(first: None, second: int, xy: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
-        centre = torch.from_numpy(data.xy[second, choose_points(40, 625)]) + truth["offset"]
-        squared = (xs[None, None] - centre[:, :1, None]) ** 2 + (ys[None, :, None] - centre[:, 1:, None]) ** 2
-        logits = -squared / (2 * 20.0**2) / matcher.temperature
-        return logits.flatten(1).softmax(-1).view(-1, 97, 97)
-
-    monkeypatch.setattr(matcher, "compute_heatmaps", compute_heatmaps)
-    monkeypatch.setattr(evaluation, "_describe", lambda matcher, data, images: {int(i): int(i) for i in images})
-    for std, temperature in ((10.0, 0.25), (20.0, 1.0), (40.0, 4.0)):
-        truth["offset"] = std * torch.randn(40, 2, generator=torch.Generator().manual_seed(0))
-        truth["offset"] *= std / truth["offset"].square().mean().sqrt()
-        assert calibrate_temperature(matcher, data, pairs=8) == pytest.approx(temperature, rel=0.05)
-        assert matcher.temperature == pytest.approx(temperature, rel=0.05)
 
 
 @pytest.fixture

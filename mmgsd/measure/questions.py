@@ -1,0 +1,102 @@
+"""The questions of an evaluation and a trained model's answers to them, compared with the truth; no baselines."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pandas as pd
+import torch
+from torch import Tensor
+from tqdm.auto import tqdm
+
+from mmgsd.config import EvaluateConfig
+from mmgsd.dataset import Dataset, sample_pairs
+from mmgsd.learn.heads import Outputs
+from mmgsd.learn.network import compute_cell_centres
+from mmgsd.match.matcher import Matcher, read_heatmap
+from mmgsd.match.mixture import Mixture
+from mmgsd.measure.metrics import LISTS, compute_mode_lists, compute_query_errors
+
+Answer = Callable[[int, int, np.ndarray, np.ndarray], tuple[Mixture, Tensor]]
+
+
+def choose_points(count: int, total: int) -> np.ndarray:
+    """``count`` of ``total`` material points spread evenly in order; all of them where there are no more."""
+    return np.unique(np.linspace(0, total - 1, min(count, total)).round().astype(int))
+
+
+def draw_pairs(data: Dataset, config: EvaluateConfig) -> np.ndarray:
+    """(pairs, 2) images of different simulations that show the object."""
+    return sample_pairs(data.episode, config.pairs, np.random.default_rng(config.seed), present=data.present)
+
+
+def ask(
+    answer: Answer, data: Dataset, config: EvaluateConfig, group: str, progress: bool, name: str, modes: int = 0
+) -> pd.DataFrame:
+    """Ask ``answer`` every query and compare with the truth; one row a query."""
+    pairs = draw_pairs(data, config)
+    symmetry, points = data.group(group), choose_points(config.points, data.n_points)
+    orbits = [symmetry.distinct_modes(int(p)) for p in points]
+    count = np.array([len(o) for o in orbits])
+    frames = []
+    for pair, (first, second) in enumerate(tqdm(pairs, desc=f"evaluate {name}", disable=not progress, leave=False)):
+        fit, entropy = answer(first, second, data.xy[first, points], count.clip(min=modes))
+        frame = pd.DataFrame({"pair": pair, "image0": first, "image1": second, "point": points})
+        frame = frame.assign(visible=data.visible[first, points], n=count, entropy=entropy.cpu().numpy())
+        hidden = [int((~data.visible[second, o]).sum()) for o in orbits]
+        frame = frame.assign(hidden=hidden, outside=fit.outside.cpu().numpy())
+        means, covariances, weights = (t.double().cpu().numpy() for t in (fit.modes, fit.covariances, fit.weights))
+        frame[list(LISTS)] = None
+        for n in np.unique(count):
+            rows = np.flatnonzero(count == n)
+            true = data.xy[second][np.stack([orbits[r] for r in rows])].astype(float)
+            for column, values in compute_query_errors(means[rows, :n], covariances[rows, :n], true).items():
+                frame.loc[rows, column] = values
+            lists = compute_mode_lists(means[rows, :n], covariances[rows, :n], weights[rows, :n], true)
+            for column, values in lists.items():
+                frame.loc[rows, column] = pd.Series(list(values.astype(np.float32)), rows)
+        frames.append(frame)
+    return pd.concat(frames, ignore_index=True)
+
+
+def model_answer(matcher: Matcher, data: Dataset, config: EvaluateConfig) -> Answer:
+    """A trained model's answers about the pairs of ``config``, whose images are described at once."""
+    descriptors = describe(matcher, data, np.unique(draw_pairs(data, config)))
+
+    def answer(first: int, second: int, xy: np.ndarray, n: np.ndarray) -> tuple[Mixture, Tensor]:
+        heatmap = matcher.compute_heatmaps(descriptors[first], descriptors[second], torch.from_numpy(xy), data.size)
+        centres = compute_cell_centres(data.size, heatmap.shape[-2:])
+        return read_heatmap(heatmap, torch.from_numpy(n), centres, roundness=matcher.config.roundness)
+
+    return answer
+
+
+def describe(matcher: Matcher, data: Dataset, indices: np.ndarray, *, batch: int = 16) -> dict[int, Outputs]:
+    """What the network says of the images, computed once each; ValueError for images of another object."""
+    if matcher.object and matcher.object != data.object:
+        raise ValueError(f"weights must be of the object {data.object!r} of {data.folder}, got weights of "
+                         f"{matcher.object!r}")  # fmt: skip
+    return dict(_describe_batches(matcher, data, indices, batch))
+
+
+def _describe_batches(
+    matcher: Matcher, data: Dataset, indices: np.ndarray, batch: int
+) -> Iterator[tuple[int, Outputs]]:
+    for start in range(0, len(indices), batch):
+        chosen = indices[start : start + batch]
+        yield from zip(chosen.tolist(), matcher.describe([data.load_image(i) for i in chosen]), strict=True)
+
+
+def measure_rmse(matcher: Matcher, data: Dataset, *, pairs: int = 60, points: int = 125, seed: int = 0) -> float:
+    """Mean RMSE (px) of the queries with a visible source: one number on images kept apart for validation."""
+    config = EvaluateConfig(pairs=pairs, points=points, seed=seed)
+    return measure_mean_error(model_answer(matcher, data, config), matcher, data, config)
+
+
+def measure_mean_error(answer: Answer, matcher: Matcher, data: Dataset, config: EvaluateConfig) -> float:
+    """Mean RMSE (px) of the answers to queries with a visible source."""
+    queries = ask(answer, data, config, matcher.config.group, False, "")
+    return float(queries.rmse_px[queries.visible].mean())
+
+
