@@ -82,8 +82,8 @@ def _calibrate(asked: argparse.Namespace) -> None:
     from mmgsd.measure.calibration import calibrate_weights
 
     found = mmgsd.load(calibrate_weights(asked.weights, asked.data, overwrite=asked.overwrite)).calibration
-    print(f"{asked.weights}: calibrated on {found.pairs} pairs of held-out simulations; each half of them, by the other, "
-          f"has an error of {found.ece_ellipse:.3f} of ellipses and {found.ece_confidence:.3f} of confidences")  # fmt: skip
+    print(f"{asked.weights}: calibrated on {found.pairs} pairs of held-out simulations; each half by the other: "
+          f"ECE {found.ece_ellipse:.3f} of ellipses, {found.ece_confidence:.3f} of confidences")  # fmt: skip
 
 
 def _heads(asked: argparse.Namespace) -> None:

@@ -169,3 +169,13 @@ def test_nothing_is_left_of_an_export_that_differs(weights, capsys, tmp_path, mo
 
 def test_onnx_needs_its_ending(weights, capsys, tmp_path):
     assert "path must end with .onnx" in fail(capsys, 2, "export", tmp_path / "cloth.pt", "--weights", weights)
+
+
+def test_weights_without_heads_are_measured_from_the_command_line(weights, cloth_dataset, capsys, tmp_path):
+    out = run(capsys, "heads", weights, "--data", cloth_dataset, "--out", tmp_path / "heads.json")
+    assert json.loads(out) == json.loads((tmp_path / "heads.json").read_text()) and json.loads(out)["heads"] is False
+
+
+def test_what_cannot_be_calibrated_is_said_from_the_command_line(weights, cloth_dataset, capsys, tmp_path):
+    assert "at least 40 pairs" in fail(capsys, 2, "calibrate", weights, "--data", cloth_dataset)
+    assert "nowhere" in fail(capsys, 2, "calibrate", weights, "--data", tmp_path / "nowhere")

@@ -69,8 +69,8 @@ def _check_file(path: Path) -> None:
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist: train a model, or give the path of its weights")
     with open(path, "rb") as file:  # PermissionError names the file
-        start = file.read(4)
-    if start.startswith(PICKLES):
+        start = file.read(9)  # of safetensors the header's length, which may be any eight bytes, and its brace
+    if start.startswith(PICKLES) and start[8:] != b"{":
         raise ValueError(f"{path} is a pickle, as PyTorch writes .pt and .pth, or an archive: give the safetensors "
                          "file that a training of mmgsd wrote")  # fmt: skip
 

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from mmgsd.figures import style as drawing
-from mmgsd.figures.uncertainty import CURVE_POINTS, plot_calibration, plot_risk_coverage
+from mmgsd.figures.uncertainty import CURVE_POINTS, plot_calibration, plot_reliability, plot_risk_coverage
 from mmgsd.measure.uncertainty import LEVELS, compute_coverage
 
 
@@ -87,3 +87,20 @@ def test_figures_are_saved_as_pdf_and_png(tmp_path):
 def test_wrong_tables_are_named(call, message):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+def test_reliability_draws_rings_before_and_intervals_after():
+    rows = pd.DataFrame({"expected": [0.1, 0.9], "observed": [0.3, 0.8], "margin": [0.1, 0.05], "count": [10, 20]})
+    figure = plot_reliability({"cloth": rows, "rope": rows.iloc[:1]}, {"cloth": rows, "rope": rows})
+    assert [axis.get_title() for axis in figure.axes] == ["Cloth", "Rope"]
+    assert get_labels(figure) == ["Gaussian", "Calibrated"]
+    diagonal, before, after, *_ = figure.axes[0].lines
+    assert list(diagonal.get_xdata()) == list(diagonal.get_ydata()) == [0, 100]
+    for line in (before, after):
+        np.testing.assert_allclose(line.get_xydata(), [[10, 30], [90, 80]])
+    (bars,) = figure.axes[0].collections
+    np.testing.assert_allclose([path.vertices[:, 1] for path in bars.get_paths()], [[20, 40], [75, 85]])
+    with pytest.raises(ValueError, match="before must not be empty"):
+        plot_reliability({}, {})
+    with pytest.raises(ValueError, match=r"same objects, got \['cloth'\] and \['rope'\]"):
+        plot_reliability({"cloth": rows}, {"rope": rows})

@@ -15,6 +15,7 @@ from safetensors.torch import save_file
 from mmgsd.config import TrainConfig, find_root
 from mmgsd.learn.network import build_network
 from mmgsd.match.matcher import Matcher, load
+from mmgsd.match.weights import _check_file
 
 CONFIG = TrainConfig(input_px=64, descriptor_dim=8)
 
@@ -156,3 +157,19 @@ def test_the_shipped_weights_load(name: str) -> None:
     matcher = load(name, device="cpu")
     assert matcher.object == matcher.config.object == name.split("-")[0]
     assert (find_root() / "data" / "weights" / f"{name}.safetensors").is_file()
+
+
+@pytest.mark.parametrize("value", ["{", "[]", "{}", '{"pairs": 3}', '{"other": 1}'])
+def test_a_damaged_calibration_is_named(matcher: Matcher, tmp_path: Path, value: str) -> None:
+    path = save_weights(tmp_path / "w.safetensors", matcher.network, calibration=value)
+    with pytest.raises(ValueError, match="w.safetensors: 'calibration' of its metadata must be what .*calibrate"):
+        Matcher.load(path)
+
+
+def test_a_header_of_any_length_is_no_pickle(matcher: Matcher, tmp_path: Path) -> None:
+    lengths = set()
+    for more in range(0, 256, 8):  # the file's first byte is the lowest of its header's length
+        path = save_weights(tmp_path / "w.safetensors", matcher.network, note="x" * more)
+        lengths.add(path.read_bytes()[0])
+        _check_file(path)
+    assert 0x80 in lengths

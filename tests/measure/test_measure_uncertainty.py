@@ -12,13 +12,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mmgsd.match.calibration import Calibration
 from mmgsd.measure.uncertainty import (
     LEVELS,
     compute_aurc,
     compute_auroc,
+    compute_confidence_error,
     compute_coverage,
     compute_coverage_error,
+    compute_reliability,
     compute_risk_coverage,
+    recalibrate,
     summarise_uncertainty,
 )
 
@@ -160,3 +164,26 @@ def test_what_is_undefined_is_null_in_json_and_does_not_warn() -> None:
     assert exact["aurc_share"] is None and exact["spearman"] is None and exact["aurc"] == 2
     assert {value for name, value in empty.items() if name != "queries"} == {None}
     assert unknown["aurc"] is None and unknown["aurc_oracle"] == 1.875
+
+
+def test_reliability_counts_by_bins_and_doubts_by_pairs() -> None:
+    confidence, near = np.array([0.05, 0.15, 0.15, 0.95, 1.0]), np.array([0, 1, 0, 1, 1])
+    rows = compute_reliability(confidence, near, np.array([0, 1, 2, 1, 2]))
+    assert rows.index.tolist() == [0, 1, 9]
+    np.testing.assert_allclose(rows.expected, [0.05, 0.15, 0.975])
+    np.testing.assert_allclose(rows.observed, [0, 0.5, 1])
+    np.testing.assert_allclose(rows.margin, [0, 1.96 * np.sqrt(0.5) / 2, 0])
+    doubled = compute_reliability(np.repeat(confidence, 2), np.repeat(near, 2), np.repeat([0, 1, 2, 1, 2], 2))
+    np.testing.assert_allclose(doubled.margin, rows.margin)  # more of the same pairs tells no more
+
+
+def test_confidence_error_by_hand() -> None:
+    modes = pd.DataFrame({"pair": [0, 1], "entropy": 0.0, "distance_px": [1.0, 99.0], "spread_px": 1e-3, "share": 1.0})
+    assert compute_confidence_error(modes, radii_px=[5.0]) == pytest.approx(0.5)
+
+
+def test_old_tables_cannot_be_recalibrated() -> None:
+    known = Calibration(tuple(range(20)), tuple(range(20)), (1.0, 0.0, 0.0), 40)
+    with pytest.raises(ValueError, match="queries must have the columns mahalanobis2, .*'distance_px'.*: ask again"):
+        recalibrate(make_queries(), known)
+    assert "ece_confidence" not in summarise_uncertainty(make_queries())
