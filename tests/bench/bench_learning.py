@@ -24,7 +24,7 @@ from mmgsd.config import METHODS, OBJECTS, Paths, TrainConfig, find_root, load_p
 from mmgsd.dataset import hold_out, load_dataset
 from mmgsd.learn.training import LOG, load_metadata, train_model
 from mmgsd.match.matcher import Matcher
-from mmgsd.measure.evaluation import measure_rmse
+from mmgsd.measure.questions import measure_rmse
 
 PACE_STEPS = 20  # steps that the pace is measured on, after as many to warm up
 
