@@ -73,7 +73,7 @@ def make_answer(pair: int, *xy: tuple[float, float]) -> dict:
 def bare(chromium: Any) -> Any:
     """A page with the explorer, pair 1 of grey 0 seen, no question asked."""
     script = base64.b64encode(Pictures._esm.encode()).decode()
-    style = (ROOT / "mmgsd" / "explorer.css").read_text()
+    style = (ROOT / "mmgsd" / "extras" / "explorer.css").read_text()
     chromium.set_content("<body></body>")
     chromium.add_style_tag(content=style)
     state = {"pair": make_pair(1), "answer": {}, "methods": [["mmgsd", "MMGSD"], ["spcl", HOSTILE]], "method": "mmgsd"}
