@@ -265,19 +265,20 @@ class Explorer {
     const hot = side === 1 && this.heat && this.shown.has("heatmap");
     drawImage(context, place, bitmaps[hot ? 2 : side], sizes[side]);
     if (hot) drawImage(context, place, this.heat, sizes[side], true);
-    this.queries.forEach(({ xy, modes }, k) => {
+    this.queries.forEach(({ xy, modes, said }, k) => {
       const { ellipses, matches } = this.answer.points[k];
       const colour = COLOURS[k % COLOURS.length];
       if (side === 0) return drawPixel(context, place, unit, colour, xy);
       const thick = (m) => (this.lit?.[0] === k && this.lit[1] === m ? 2 * unit : unit);
       if (this.shown.has("modes")) {
-        ellipses.forEach((mode, m) => drawMode(context, place, thick(m), colour, mode, modes[m].weight));
+        const how = (m) => ({ hidden: isHidden(modes[m]), faint: said });
+        ellipses.forEach((mode, m) => drawMode(context, place, thick(m), colour, mode, modes[m].weight, how(m)));
       }
       if (this.shown.has("true matches")) matches.forEach((match) => drawCross(context, place, unit, colour, match));
     });
   }
 
-  makeTable({ xy, modes, entropy, outside }, k) {
+  makeTable({ xy, modes, entropy, outside, said }, k) {
     const dot = () => make("span", { className: "mmgsd-dot", style: `background: ${COLOURS[k % COLOURS.length]}` });
     const row = (kind, cells) => make("tr", {}, ...cells.map((cell) => make(kind, {}, ...[cell].flat())));
     const percent = (value) => `${(100 * value).toFixed(0)} %`;
@@ -286,7 +287,8 @@ class Explorer {
     const rows = modes.map((mode, m) => {
       const [x, y] = mode.xy.map((value) => value.toFixed(1));
       const spread = `± ${mode.spread_px.toFixed(0)} px`;
-      const node = row("td", [[dot(), `${m + 1}`], x, y, share(mode.weight), spread, share(mode.confidence)]);
+      const seen = mode.visible === undefined ? [] : [`${isHidden(mode) ? "hidden" : "seen"}, ${percent(mode.visible)}`];
+      const node = row("td", [[dot(), `${m + 1}`], x, y, share(mode.weight), spread, share(mode.confidence), ...seen]);
       const light = (lit) => () => {
         this.lit = lit;
         this.draw();
@@ -295,9 +297,11 @@ class Explorer {
     });
     const place = xy.map((value) => value.toFixed(0)).join(", ");
     const rest = ` at (${place}) · entropy ${entropy.toFixed(1)} nats · ${percent(outside)} outside the modes`;
-    const head = row("th", ["mode", "x px", "y px", "weight", "spread", "confidence"]);
-    head.lastChild.title = "How probable a true match within 20 px is";
-    return make("table", {}, make("caption", {}, dot(), make("b", { textContent: `Point ${k + 1}` }), rest),
+    const known = modes[0]?.visible === undefined ? [] : ["seen there"];
+    const head = row("th", ["mode", "x px", "y px", "weight", "spread", "confidence", ...known]);
+    head.children[5].title = "How probable a true match within 20 px is";
+    const why = said ? [make("div", { className: "mmgsd-why", textContent: said })] : [];
+    return make("table", {}, make("caption", {}, dot(), make("b", { textContent: `Point ${k + 1}` }), rest, ...why),
       make("thead", {}, head), make("tbody", {}, ...rows));
   }
 
@@ -327,6 +331,8 @@ class Explorer {
   }
 }
 
+const isHidden = ({ visible }) => visible < 0.5; // where it is known
+
 function makeLegend(colours) {
   const bar = make("canvas", { width: 64, height: 10, style: "border-radius: 2px" });
   for (let k = 0; k < 64; k++) {
@@ -339,6 +345,7 @@ function makeLegend(colours) {
     [sign((...where) => drawPixel(...where, [0, 0])), "asked pixel"],
     [sign((...where) => drawMode(...where, mode, 0.25)), "mode, larger with its weight"],
     [sign((...where) => drawMode(...where, { ...mode, major: 15, minor: 9 }, 0)), "its spread, 1 std"],
+    [sign((...where) => drawMode(...where, mode, 0.25, { hidden: true })), "hidden there, where known"],
     [sign((...where) => drawCross(...where, [0, 0])), "true match, where known"],
     [bar, "heatmap of the last point, up to its maximum"],
   ];

@@ -22,11 +22,11 @@ import cv2
 import numpy as np
 import traitlets
 
-from mmgsd.__main__ import describe_answer
 from mmgsd.extras.explorer_scenes import Scene
 from mmgsd.figures.style import FADED, HEAT, METHOD_LABELS, compute_ellipse, compute_strength, fade_image
 from mmgsd.images import decode_image
 from mmgsd.match.baselines import BaselineMatcher
+from mmgsd.match.describe import describe_answer
 from mmgsd.match.match import Match
 
 QUALITY = 90  # of what the browser is sent, JPEG

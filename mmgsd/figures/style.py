@@ -21,6 +21,7 @@ from matplotlib.patches import Ellipse
 
 from mmgsd.config import N_POINTS
 from mmgsd.files import writing
+from mmgsd.match.describe import find_hidden, say_presence
 from mmgsd.match.matcher import Match
 
 METHOD_LABELS = {
@@ -45,6 +46,7 @@ COLUMN_IN, PAGE_IN = 3.5, 7.1  # widths of a column and of a page
 MARK = "#FFE100"  # the asked pixel
 
 HEAT = colormaps["inferno"](np.linspace(0.3, 1, 256))[:, :3].astype(np.float32)  # from cold to hot
+FAINT = 0.35  # opacity of modes where there is no answer
 FADED = 0.75  # brightness of an image under a heatmap
 
 _SANS = ["DejaVu Sans"]  # comes with matplotlib: the same letters everywhere
@@ -97,14 +99,19 @@ def show_answer(axis: Axes, match: Match, index: int, *, modes: bool = True) -> 
 
 
 def draw_modes(axis: Axes, match: Match, index: int) -> None:
-    """Rings at the modes of one query, their area the weight, and the 1-std ellipses."""
-    for (x, y), weight, covariance in zip(match.modes[index], match.weights[index], match.covariances[index],
-                                          strict=True):  # fmt: skip
-        if not np.isfinite(x):
-            continue
-        radii, angle = compute_ellipse(covariance)
-        axis.add_patch(Ellipse((x, y), *(2 * radii), angle=np.degrees(angle), fill=False, ec="white", lw=0.7))
-        axis.scatter(x, y, s=4 + 40 * weight, c="none", edgecolors="#00E0FF", linewidths=0.9)
+    """Rings at the modes of one query, their area the weight, and the 1-std ellipses; of hidden ones dashed.
+
+    Faint where the query has no answer (`say_presence`).
+    """
+    alpha, hidden = FAINT if say_presence(match, index) else 1.0, find_hidden(match, index)
+    for k in np.flatnonzero(np.isfinite(match.modes[index]).all(-1)):
+        radii, angle = compute_ellipse(match.covariances[index, k])
+        stroke = {"linestyle": (0, (2, 1.5)) if hidden[k] else "-", "alpha": alpha}
+        x, y = match.modes[index, k]
+        ellipse = Ellipse((x, y), *(2 * radii), angle=np.degrees(angle), fill=False, ec="white", lw=0.7, **stroke)
+        axis.add_patch(ellipse)
+        size = 4 + 40 * match.weights[index, k]
+        axis.scatter(x, y, s=size, c="none", edgecolors="#00E0FF", linewidths=0.9, **stroke)
 
 
 def compute_ellipse(covariance: np.ndarray) -> tuple[np.ndarray, float]:

@@ -13,7 +13,6 @@ import pytest
 import torch
 from PIL import Image
 
-from mmgsd.__main__ import describe_answer
 from mmgsd.config import TrainConfig
 from mmgsd.dataset import load_dataset
 from mmgsd.extras.explorer import DISPLAY_PX, MOST_PINS, Explorer, prepare_baseline, show_scene
@@ -28,6 +27,7 @@ from mmgsd.extras.explorer_scenes import (
 )
 from mmgsd.learn.network import build_network
 from mmgsd.match.baselines import BaselineMatcher
+from mmgsd.match.describe import describe_answer
 from mmgsd.match.matcher import Matcher
 
 CONFIG = TrainConfig(input_px=64, descriptor_dim=4)
