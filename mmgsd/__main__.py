@@ -48,6 +48,7 @@ def make_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="command")
     _add_match(commands.add_parser("match", help="find all matches of pixels of an image in others", epilog=EXAMPLE))
     _add_segment(commands.add_parser("segment", help="write where an image shows the object"))
+    _add_measure(commands.add_parser("measure", help="measure on photographs with marked corners or ends"))
     _add_export(commands.add_parser("export", help="write a network as ONNX: image in, descriptors out"))
     for name, command in commands.choices.items():
         default = {"default": "cloth"} if name == "measure" else {"required": True}
@@ -76,6 +77,15 @@ def _add_segment(segment: argparse.ArgumentParser) -> None:
     segment.add_argument("image", type=Path, help="the image to look at")
     segment.add_argument("out", type=Path, help="the mask to write, .png: brighter than half on the object")
     segment.set_defaults(run=cli.segment)
+
+
+def _add_measure(measure: argparse.ArgumentParser) -> None:
+    measure.add_argument("place", type=Path, metavar="FOLDER",
+                         help="with index.json, or such a file; its format: mmgsd/measure/photographs.py")  # fmt: skip
+    measure.add_argument("--out", type=_parse_picture, metavar="FILE", help="draw an answer about each photograph")
+    measure.add_argument("--store", metavar="NAME", help="write the numbers to data/results/photographs_NAME.json")
+    measure.add_argument("--json", action="store_true", help="print the numbers as JSON")
+    measure.set_defaults(run=cli.measure)
 
 
 def _add_export(export: argparse.ArgumentParser) -> None:

@@ -150,7 +150,7 @@ def save_picture(figure: Any, path: Path) -> None:
 
     matplotlib.use("Agg")
     with writing(path) as aside:
-        figure.savefig(aside, format=path.suffix[1:].lower(), dpi=DPI)
+        figure.savefig(aside, format=path.suffix[1:].lower(), dpi=DPI, bbox_inches="tight", pad_inches=0.05)
 
 
 def segment(asked: argparse.Namespace) -> None:
@@ -163,6 +163,25 @@ def segment(asked: argparse.Namespace) -> None:
     grey = np.rint(255 * mask).astype(np.uint8)
     write_bytes(asked.out, cv2.imencode(".png", grey)[1].tobytes())
     print(f"{asked.out}: brighter than half on the object, {np.mean(mask > 0.5):.0%} of the image")
+
+
+def measure(asked: argparse.Namespace) -> None:
+    """Measure on marked photographs: print a table or JSON, write a contact sheet and the results where asked."""
+    from mmgsd.figures.photographs import ContactSheet
+    from mmgsd.measure.photographs import check_name, make_photographs_table, measure_photographs, store_photographs
+
+    if asked.store:
+        check_name(asked.store)
+    if asked.out and asked.out.exists() and asked.out.resolve().is_relative_to(asked.place.resolve()):
+        raise ValueError(f"--out must not replace a file among the photographs, got {asked.out}")
+    sheet = ContactSheet()
+    looking = {"seen": sheet.add} if asked.out else {}
+    results = measure_photographs(asked.weights, asked.place, progress=sys.stderr.isatty(), **looking)
+    if asked.out:
+        save_picture(sheet.plot(), asked.out)
+    if asked.store:
+        store_photographs(results, asked.store)
+    print(json.dumps(results) if asked.json else make_photographs_table(results), flush=True)
 
 
 def export(asked: argparse.Namespace) -> None:

@@ -232,6 +232,42 @@ def test_what_is_wrong_with_a_folder_is_said_at_once(weights, images, frames, ca
     assert message in said and "skipped" not in said
 
 
+@pytest.fixture
+def marked(images, tmp_path) -> Path:
+    """Two marked photographs."""
+    folder = tmp_path / "photographs"
+    folder.mkdir()
+    for name in "ab":
+        Image.open(images[0]).convert("RGB").save(folder / f"{name}.png")
+    corners = [[50, 50], [100, 50], [100, 100], [50, 100]]
+    (folder / "index.json").write_text(json.dumps([{"file": f"{n}.png", "corners": corners} for n in "ab"]))
+    return folder
+
+
+def test_photographs_are_measured(weights, marked, capsys, tmp_path, monkeypatch):
+    monkeypatch.setattr("mmgsd.measure.photographs.find_root", lambda: tmp_path)
+    asked = ["measure", marked, "--weights", weights]
+    table = run(capsys, *asked, "--out", tmp_path / "sheet.png", "--store", "mine")
+    assert table.splitlines()[-1].split()[:2] == ["all", "8"]
+    assert Image.open(tmp_path / "sheet.png").size[0] > 300
+    results = json.loads(run(capsys, *asked, "--json"))
+    assert json.loads((tmp_path / "data" / "results" / "photographs_mine.json").read_text()) == results
+    assert results["photographs"] == 2 and results["sources"].keys() == {"own"}
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("--out MARKED/a.png", "--out must not replace a file among the photographs"),
+        ("--store ../mine", "name must be of letters, digits, - and _, got '../mine'"),
+        ("--weights towel", "towel must be a safetensors file or one of 'cloth', "),
+    ],
+)
+def test_what_is_wrong_with_photographs_is_said(weights, marked, capsys, words, message):
+    words = words.replace("MARKED", str(marked)).split()
+    assert message in fail(capsys, 2, "measure", marked, "--weights", weights, *words)
+
+
 def test_the_picture_does_not_replace_an_image(weights, images, capsys):
     before = Path(images[0]).read_bytes()
     said = fail(capsys, 2, "match", *images, "--xy", "5,5", "--weights", weights, "--out", images[0])

@@ -9,7 +9,8 @@ const PARTS = { heatmap: "h", modes: "m", "true matches": "t" };
 const HELP = [["click, drag", "ask"], ["shift + click", "pin"], ["ctrl + wheel", "zoom"], ["alt + drag", "move"],
   ["p", "previous"], ["r", "random"], ["n", "next"], ["h", "heatmap"], ["m", "modes"], ["t", "true matches"],
   ["v", "move or ask"], ["+", "closer"], ["-", "farther"], ["0", "fit"], ["c", "clear"], ["f", "full screen"],
-  ["s", "save picture"], ["j", "save JSON"]];
+  ["s", "save picture"], ["j", "save JSON"],
+  ["k", "save marks"]];
 
 class Explorer {
   constructor(model) {
@@ -41,7 +42,8 @@ class Explorer {
     this.line = make("div", { className: "mmgsd-line", ariaLive: "polite" });
     this.tables = make("div", { className: "mmgsd-tables" });
     this.savers = [button("save picture", "Both pictures with their marks, as PNG (s)", () => this.savePicture()),
-      button("save JSON", "The answer, as of python -m mmgsd match --json (j)", () => this.saveJson())];
+      button("save JSON", "The answer, as of python -m mmgsd match --json (j)", () => this.saveJson()),
+      button("save marks", "Points pinned on left images, for python -m mmgsd measure (k)", () => this.saveMarks())];
     this.clearer = button("clear points", "Forget all points (c)", () => this.send({ do: "clear" }));
     this.box = make("div", { className: "mmgsd-explorer", tabIndex: 0 },
       make("div", { className: "mmgsd-bar" },
@@ -211,7 +213,7 @@ class Explorer {
       p: step("previous"), r: step("random"), n: step("next"), v: () => this.setMoving(!this.moving),
       "+": () => this.zoom(1.5), "=": () => this.zoom(1.5), "-": () => this.zoom(1 / 1.5), 0: () => this.fit(),
       c: () => this.send({ do: "clear" }), f: () => this.toggleScreen(),
-      s: () => this.savePicture(), j: () => this.saveJson(),
+      s: () => this.savePicture(), j: () => this.saveJson(), k: () => this.saveMarks(),
       ...Object.fromEntries(Object.entries(PARTS).map(([part, key]) => [key, () => this.toggle(part)])),
     }[event.key.toLowerCase()];
     if (!act) return;
@@ -328,6 +330,12 @@ class Explorer {
 
   saveJson() {
     if (this.queries?.length) download(new Blob([this.answer.json, "\n"], { type: "application/json" }), "mmgsd.json");
+  }
+
+  saveMarks() {
+    const marks = this.model.get("marks");
+    if (marks === "[]") return this.say("Pin points on the left image first: shift + click.", true);
+    download(new Blob([marks, "\n"], { type: "application/json" }), "index.json");
   }
 }
 

@@ -28,6 +28,7 @@ from mmgsd.images import decode_image
 from mmgsd.match.baselines import BaselineMatcher
 from mmgsd.match.describe import describe_answer
 from mmgsd.match.match import Match
+from mmgsd.measure.photographs import describe_marks
 
 QUALITY = 90  # of what the browser is sent, JPEG
 DISPLAY_PX = 1600  # longer side of what the browser is sent
@@ -45,6 +46,7 @@ class Pictures(anywidget.AnyWidget):
     _esm = "\n".join(Path(__file__).with_name(name).read_text("utf-8") for name in SCRIPTS)
     _css = Path(__file__).with_name("explorer.css")
     pair = traitlets.Dict().tag(sync=True)  # id, number, count, names, sizes; JPEG image0, image1, faded1; truth
+    marks = traitlets.Unicode("[]").tag(sync=True)  # JSON for ``python -m mmgsd measure``: what is pinned on the left
     answer = traitlets.Dict().tag(sync=True)  # pair, number, milliseconds, json, points, heat, heat_size
     methods = traitlets.List().tag(sync=True)  # [name, label] of each
     method = traitlets.Unicode().tag(sync=True)
@@ -66,7 +68,7 @@ class Explorer:
         if not matchers or not scenes:
             raise ValueError("matchers and scenes must not be empty")
         self.matchers, self.scenes, self.pairs_opened, self.answers = dict(matchers), list(scenes), 0, 0
-        self.rng, self._own, self._parts = np.random.default_rng(), None, {}
+        self.rng, self._own, self._parts, self.marks = np.random.default_rng(), None, {}, {}
         methods = [[name, METHOD_LABELS.get(name, name)] for name in self.matchers]
         self.pictures = Pictures(methods=methods, method=methods[0][0])
         self.pictures.on_msg(self._on_message)
@@ -93,6 +95,8 @@ class Explorer:
             raise ValueError(f"{MOST_PINS} points are pinned, and there are no colours for more: clear them first")
         answer = self._answer([*pins, xy])
         self.pins, self.xy = (pins + [xy], None) if pin else (pins, xy)
+        if pin:
+            self._mark()
         return answer
 
     @property
@@ -120,6 +124,15 @@ class Explorer:
         """Forget every pixel that was asked about."""
         self.pins, self.xy = [], None
         self._answer([])
+        self._mark()
+
+    def _mark(self) -> None:
+        """Take what is pinned for the marked places of the left image; they stay when another is opened."""
+        file, kind = self.scene.name0, getattr(self.matchers[self.method], "object", "")
+        self.marks.pop(file, None)
+        if self.pins:
+            self.marks[file] = describe_marks(file, self.pins, kind)
+        self.pictures.marks = json.dumps(list(self.marks.values()), indent=1)
 
     def open_own(self, side: int, image: np.ndarray, name: str) -> None:
         """Show the user's image as the left (0) or right (1) one beside what is there; a pair after all others."""

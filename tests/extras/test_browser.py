@@ -29,6 +29,7 @@ STAND_IN = """async ([script, state]) => {
     traits.pair = load(traits.pair);
     window.sent = [];
     window.kernel = {
+        keep: (name, value) => { traits[name] = value; },
         tell: (message) => heard['msg:custom'](message),
         set: (name, values) => { traits[name] = load(values); heard[`change:${name}`](); },
     };
@@ -76,7 +77,7 @@ def bare(chromium: Any) -> Any:
     style = (ROOT / "mmgsd" / "extras" / "explorer.css").read_text()
     chromium.set_content("<body></body>")
     chromium.add_style_tag(content=style)
-    state = {"pair": make_pair(1), "answer": {}, "methods": [["mmgsd", "MMGSD"], ["spcl", HOSTILE]], "method": "mmgsd"}
+    state = {"pair": make_pair(1), "answer": {}, "marks": "[]", "methods": [["mmgsd", "MMGSD"], ["spcl", HOSTILE]], "method": "mmgsd"}
     colours = base64.b64encode(bytes(768)).decode()
     chromium.evaluate(STAND_IN, [script, {**state, "heat_colours": {"base64": colours}}])
     chromium.get_by_text("left 1").wait_for()
@@ -114,6 +115,17 @@ def test_what_is_hidden_or_absent_is_said(bare: Any) -> None:
     show(bare, "answer", answer)
     assert bare.locator(".mmgsd-why").count() == 0
     assert (look(bare) != faint).any()
+
+
+def test_pinned_points_are_saved_as_marks(bare: Any) -> None:
+    bare.get_by_role("button", name="save marks").click()
+    assert "Pin points on the left image first" in bare.locator(".mmgsd-line").inner_text()
+    marks = json.dumps([{"file": "a.jpg", "ends": [[3.0, 4.0]]}])
+    bare.evaluate("marks => window.kernel.keep('marks', marks)", marks)
+    with bare.expect_download() as saved:
+        bare.locator(".mmgsd-explorer").press("k")
+    assert saved.value.suggested_filename == "index.json"
+    assert Path(saved.value.path()).read_text() == marks + "\n"
 
 
 def test_text_from_files_stays_text(bare: Any) -> None:

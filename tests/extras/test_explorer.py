@@ -75,6 +75,21 @@ def test_a_click_is_answered_for_its_pixel(explorer: Explorer) -> None:
     assert len(answer["heat"]) == np.prod(answer["heat_size"]) and max(answer["heat"]) == 255
 
 
+def test_pins_of_every_left_image_are_its_marks(explorer: Explorer) -> None:
+    one = explorer.scene.name0
+    assert tell(explorer, "ask", xy=[240, 200], pin=True) is None
+    assert tell(explorer, "ask", xy=[30, 20]) is None  # is no mark
+    explorer.open_own(0, np.zeros((50, 60, 3), np.uint8), "towel.jpg")
+    for x in (5, 6, 7, 8):
+        assert tell(explorer, "ask", xy=[x, 9.06], pin=True) is None
+    assert json.loads(explorer.pictures.marks) == [
+        {"file": one, "kind": "cloth", "visible_corners_unordered": [[240, 200]]},
+        {"file": "towel.jpg", "kind": "cloth", "corners": [[x, 9.1] for x in (5, 6, 7, 8)]},
+    ]
+    assert tell(explorer, "clear") is None
+    assert [entry["file"] for entry in json.loads(explorer.pictures.marks)] == [one]
+
+
 def test_the_saved_answer_is_what_the_command_prints(explorer: Explorer) -> None:
     answer = explorer.ask(240, 200)
     assert explorer.pictures.answer["json"] == json.dumps(describe_answer(answer))
