@@ -25,7 +25,7 @@ import traitlets
 from mmgsd.extras.explorer_scenes import Scene
 from mmgsd.figures.style import FADED, HEAT, METHOD_LABELS, compute_ellipse, compute_strength, fade_image
 from mmgsd.images import decode_image
-from mmgsd.match.baselines import BaselineMatcher
+from mmgsd.match.baselines import FeatureMatcher
 from mmgsd.match.describe import describe_answer
 from mmgsd.match.match import Match
 from mmgsd.measure.photographs import describe_marks
@@ -60,7 +60,7 @@ class Pictures(anywidget.AnyWidget):
 class Explorer:
     """The two pictures with everything around them; ``show()`` them in a notebook.
 
-    ``matchers`` {name: `Matcher` or `BaselineMatcher`}; ``scenes`` are pairs of images, or functions that load one.
+    ``matchers`` {name: `Matcher` or `FeatureMatcher`}; ``scenes`` are pairs of images, or functions that load one.
     Click or drag in the left image; ``ask(x, y)`` does the same from code.
     """
 
@@ -160,7 +160,7 @@ class Explorer:
         name = self.method
         if name not in self._prepared:
             matcher, scene = self.matchers[name], self.scene
-            baseline = isinstance(matcher, BaselineMatcher)
+            baseline = isinstance(matcher, FeatureMatcher)
             self._prepared[name] = (
                 prepare_baseline(matcher, scene) if baseline else matcher.prepare(scene.image0, scene.image1).match
             )
@@ -244,8 +244,8 @@ def describe_ellipses(match: Match, query: int = 0) -> list[dict[str, float]]:
     return described
 
 
-def prepare_baseline(matcher: BaselineMatcher, scene: Scene) -> Callable[[np.ndarray], Match]:
-    """Answers of hand-made descriptors, which see large images made smaller; pixels (S, 2) are those of the large."""
+def prepare_baseline(matcher: FeatureMatcher, scene: Scene) -> Callable[[np.ndarray], Match]:
+    """Answers of baselines, which see large images made smaller; pixels (S, 2) are those of the large."""
     small = [_shrink(image, BASELINE_PX) for image in (scene.image0, scene.image1)]
     size = (small[1].shape[1], small[1].shape[0])
     mask = None if scene.mask1 is None else cv2.resize(scene.mask1.astype(np.uint8), size, interpolation=0).astype(bool)

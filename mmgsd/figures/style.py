@@ -31,7 +31,8 @@ METHOD_LABELS = {
     "mmgsd_long": "MMGSD, longer", "mmgsd_fine": "MMGSD, finer", "mmgsd_fine_deep": "MMGSD, finest",
     "mmgsd_muon": "MMGSD, Muon",
     "sift": "SIFT", "orb": "ORB",
-    "surf": "SURF", "akaze": "AKAZE", "daisy": "DAISY", "centre": "Object centre", "random": "Random points",
+    "surf": "SURF", "akaze": "AKAZE", "daisy": "DAISY", "imagenet": "ImageNet features",
+    "centre": "Object centre", "random": "Random points",
 }  # fmt: skip
 METHOD_COLOURS = {
     "mmgsd": "#D55E00", "spcl": "#0072B2", "pcl": "#56B4E9", "unimodal": "#009E73", "spcl_dense": "#88CCEE",
@@ -39,7 +40,8 @@ METHOD_COLOURS = {
     "mmgsd_long": "#8A3500", "mmgsd_fine": "#4D1D00", "mmgsd_fine_deep": "#260F00",
     "mmgsd_muon": "#FF3D00",
     "sift": "#CC79A7", "orb": "#999933",
-    "surf": "#882255", "akaze": "#332288", "daisy": "#E69F00", "centre": "#404040", "random": "#9A9A9A",
+    "surf": "#882255", "akaze": "#332288", "daisy": "#E69F00", "imagenet": "#117733",
+    "centre": "#404040", "random": "#9A9A9A",
 }  # fmt: skip
 CHANCE_STYLES = {"centre": "--", "random": ":"}
 COLUMN_IN, PAGE_IN = 3.5, 7.1  # widths of a column and of a page

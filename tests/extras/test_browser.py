@@ -77,9 +77,9 @@ def bare(chromium: Any) -> Any:
     style = (ROOT / "mmgsd" / "extras" / "explorer.css").read_text()
     chromium.set_content("<body></body>")
     chromium.add_style_tag(content=style)
-    state = {"pair": make_pair(1), "answer": {}, "marks": "[]", "methods": [["mmgsd", "MMGSD"], ["spcl", HOSTILE]], "method": "mmgsd"}
+    state = {"pair": make_pair(1), "answer": {}, "methods": [["mmgsd", "MMGSD"], ["spcl", HOSTILE]], "method": "mmgsd"}
     colours = base64.b64encode(bytes(768)).decode()
-    chromium.evaluate(STAND_IN, [script, {**state, "heat_colours": {"base64": colours}}])
+    chromium.evaluate(STAND_IN, [script, {**state, "marks": "[]", "heat_colours": {"base64": colours}}])
     chromium.get_by_text("left 1").wait_for()
     return chromium
 

@@ -150,7 +150,7 @@ def test_places_and_sizes(folder: Path, entry: dict, places: int, askable: bool,
 def test_what_the_explorer_saves_is_read(folder: Path) -> None:
     two = SQUARE[:2].tolist()
     for kind, pins in (("cloth", SQUARE.tolist()), ("cloth", two), ("rope", two), ("shirt", two), ("", two)):
-        read = read_one(folder, kind or "cloth", **describe_marks("0.png", pins, kind))
+        read = read_one(folder, **{"kind": kind or "cloth", **describe_marks("0.png", pins, kind)})
         assert read.xy.tolist() == pins and read.askable == (kind != "cloth" or len(pins) == 4)
 
 
