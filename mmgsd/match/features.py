@@ -16,7 +16,7 @@ from mmgsd.learn.network import IMAGENET_MEAN, IMAGENET_STD, build_trunk, comput
 
 Extractor = Callable[[np.ndarray], Any]  # (H, W, 3) uint8 -> (D, h, w)
 LONGEST_PX, MULTIPLE_PX = 640, 32  # of what EfficientNet-Lite0 is given: about the sizes it was made for, and up
-TAPS_TAKEN = (2,)  # of strides 4, 8, 16, 32
+TAP = 2  # of strides 4, 8, 16 and 32 px, that of 16: on the sample it finds the most
 
 
 def sample_features(features: Any, xy: np.ndarray, size: tuple[int, int]) -> np.ndarray:
@@ -29,7 +29,8 @@ def sample_features(features: Any, xy: np.ndarray, size: tuple[int, int]) -> np.
         raise ValueError(f"extractor must return numbers (D, h, w), got {values.dtype} {values.shape}")
     values = torch.from_numpy(values.astype(np.float32))
     if 0 in values.shape or not values.isfinite().all():
-        raise ValueError(f"extractor must return finite numbers (D, h, w), got others, or none, in {tuple(values.shape)}")
+        shape = tuple(values.shape)
+        raise ValueError(f"extractor must return finite numbers (D, h, w), got others, or none, in {shape}")
     places = torch.from_numpy(np.asarray(xy, np.float32))[None]
     return F.normalize(sample_descriptors(values[None], places, size)[0], dim=-1).numpy()
 
@@ -41,10 +42,7 @@ def extract_imagenet(image: np.ndarray) -> Tensor:
     size = [max(1, round(side * scale / MULTIPLE_PX)) * MULTIPLE_PX for side in image.shape[1::-1]]
     x = torch.from_numpy(cv2.resize(image, size, interpolation=cv2.INTER_AREA)).permute(2, 0, 1)[None].float() / 255
     x = (x - torch.tensor(IMAGENET_MEAN).view(3, 1, 1)) / torch.tensor(IMAGENET_STD).view(3, 1, 1)
-    taps = compute_taps(_load_trunk(), x)
-    finest = taps[TAPS_TAKEN[0]].shape[-2:]
-    parts = [F.interpolate(F.normalize(taps[k], dim=1), finest, mode="bilinear") for k in TAPS_TAKEN]
-    return torch.cat(parts, 1)[0]
+    return compute_taps(_load_trunk(), x)[TAP][0]
 
 
 @cache
