@@ -209,6 +209,15 @@ def test_a_folder_is_answered_for_but_for_what_is_damaged(weights, images, frame
     assert sorted(path.name for path in (tmp_path / "drawn").iterdir()) == ["a.png.png", "c.png.png"]
 
 
+def test_one_image_may_have_a_table_too(seeing, images, capsys, tmp_path):
+    out = tmp_path / "new" / "one.csv"
+    (query,) = json.loads(run(capsys, "match", *images, "--xy", "5,5", "--weights", seeing, "--csv", out, "--json"))
+    table = pd.read_csv(out)
+    assert table["mode"].tolist() == [1, 2, 3, 4] and set(table.image1) == {"b.jpg"}
+    assert table.visible.tolist() == [mode["visible"] for mode in query["modes"]]
+    assert set(table.absent) == {query["absent"]} and set(table.on_object) == {query["on_object"]}
+
+
 def test_a_folder_without_damage_is_a_success(weights, images, frames, capsys):
     (frames / "b.png").unlink()
     first, second = run(capsys, "match", images[0], frames, "--xy", "5,5", "--weights", weights).splitlines()

@@ -23,6 +23,7 @@ only those with all corners), is asked for in every other photograph with places
 from __future__ import annotations
 
 import hashlib
+import json
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -35,7 +36,7 @@ from tqdm.auto import tqdm
 
 from mmgsd.config import find_root
 from mmgsd.dataset import load_dataset
-from mmgsd.files import DamagedFileError, read_json, write_json
+from mmgsd.files import DamagedFileError, read_json, write_json, write_text
 from mmgsd.images import check_pixels, read_image
 from mmgsd.match.match import Match
 from mmgsd.match.matcher import Matcher, find_weights
@@ -230,3 +231,10 @@ def mark_dataset(folder: Path | str, relative: str, *, split: str = "test") -> l
         places = places if key == "corners" else [place for place in places if place]
         entries.append({"file": f"{relative}/{file}", "kind": data.object, "repo": "rendered", key: places})
     return entries
+
+
+def write_sample_marks(folder: Path | str) -> Path:
+    """Write ``photographs.json`` of the sample's data sets in ``folder``, which stand in for photographs of yours."""
+    entries = [entry for name in ENDS for entry in mark_dataset(Path(folder) / name, name)]
+    lines = ",\n".join(f" {json.dumps(entry)}" for entry in entries)
+    return write_text(Path(folder) / "photographs.json", f"[\n{lines}\n]\n")
