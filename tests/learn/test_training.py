@@ -310,7 +310,7 @@ def test_noise_tells_no_match_from_a_non_match(
 ) -> None:
     """Else a network learns how the two are sampled, not what they show: the shortest way to a small loss."""
     distances = []
-    monkeypatch.setattr(training.losses, method, lambda *both, margin: distances.append(both) or torch.zeros(()))
+    monkeypatch.setattr("mmgsd.learn.losses." + method, lambda *both, margin: distances.append(both) or torch.zeros(()))
     data = load_dataset(cloth_dataset)
     config = dataclasses.replace(TINY, method=method, queries=256)
     batch = make_batch(load_training_images(data, 64), np.arange(4), config, rng, torch.device("cpu"))

@@ -156,3 +156,13 @@ def test_the_shipped_weights_load(name: str) -> None:
     matcher = load(name, device="cpu")
     assert matcher.object == matcher.config.object == name.split("-")[0]
     assert (find_root() / "data" / "weights" / f"{name}.safetensors").is_file()
+
+
+def test_a_header_that_begins_as_a_pickle_does_is_no_pickle(matcher: Matcher, tmp_path: Path) -> None:
+    path = tmp_path / "w.safetensors"
+    for spare in range(0, 512, 8):  # the header's length, of whose bytes the first is the file's first
+        save_weights(path, matcher.network, spare="x" * spare)
+        if path.read_bytes()[0] == 0x80:
+            break
+    assert path.read_bytes()[0] == 0x80
+    assert Matcher.load(path, device="cpu").modes == matcher.modes
