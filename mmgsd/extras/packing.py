@@ -245,6 +245,10 @@ def main() -> None:
             print(f"{unpack_dataset(archive, folder)}: complete and checked")
         else:
             print(f"{write_sample(folder, paths.root / 'data' / 'sample' / name, quality=asked.quality)}: checked")
+    if asked.action == "sample":
+        from mmgsd.measure.photographs import write_sample_marks  # needs torch, as nothing else here
+
+        print(f"{write_sample_marks(paths.root / 'data' / 'sample')}: their corners and ends")
 
 
 if __name__ == "__main__":

@@ -35,6 +35,7 @@ from mmgsd.figures.style import (
     show_source,
     styled,
 )
+from mmgsd.match.describe import say_presence
 from mmgsd.match.matcher import Match
 from mmgsd.measure.metrics import BIN_PX, ErrorSummary
 
@@ -47,7 +48,9 @@ PAGE_QUERIES, PANEL_PX = 100, 640  # on one page at most; the longer side of an 
 def plot_match(match: Match, index: int = 0) -> Figure:
     """Source image with the pixel of one query, target image with heatmap and modes; the title gives the entropy.
 
-    Each mode has its 1-std ellipse, its marker's area shows its weight. ValueError where ``index`` is not in [0, S).
+    Each mode has its 1-std ellipse, its marker's area shows its weight; of one that is hidden they are dashed. Where
+    the pixel or the target does not show the object the title says so instead, where that is known.
+    ValueError where ``index`` is not in [0, S).
     """
     whole = isinstance(index, int | np.integer) and not isinstance(index, bool)
     if not whole or not 0 <= index < len(match):
@@ -56,7 +59,7 @@ def plot_match(match: Match, index: int = 0) -> Figure:
     show_source(axes[0, 0], match, index)
     show_answer(axes[0, 1], match, index)
     axes[0, 0].set_title("Source")
-    axes[0, 1].set_title(f"Matches · entropy {match.entropy[index]:.1f} nats")
+    axes[0, 1].set_title(say_presence(match, index) or f"Matches · entropy {match.entropy[index]:.1f} nats")
     return figure
 
 
@@ -68,7 +71,7 @@ def plot_page(match: Match) -> Figure:
     """
     if not 1 <= len(match) <= PAGE_QUERIES:
         raise ValueError(f"match must hold 1 to {PAGE_QUERIES} queries to be drawn, got {len(match)}")
-    small = _shrink(match)
+    small = shrink_match(match)
     aspect = max(image.shape[0] / image.shape[1] for image in (match.image0, match.image1))
     columns = 4 if len(match) > 1 else 2
     figure, axes = make_grid([aspect] * -(-2 * len(match) // columns), columns, PAGE_IN)
@@ -79,11 +82,12 @@ def plot_page(match: Match) -> Figure:
         show_answer(answer, small, index)
         x, y = match.xy[index]
         source.set_title(f"{index + 1} · pixel {x:g}, {y:g}")
-        answer.set_title(f"entropy {match.entropy[index]:.1f} nats")
+        said = say_presence(match, index).partition(":")[0]  # a panel has room for a word
+        answer.set_title(said or f"entropy {match.entropy[index]:.1f} nats")
     return figure
 
 
-def _shrink(match: Match) -> Match:
+def shrink_match(match: Match) -> Match:
     """The same answer about images of at most PANEL_PX: what a panel of a page shows, in a page's memory."""
     places = {}
     for name in ("image0", "image1"):

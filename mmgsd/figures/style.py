@@ -21,6 +21,7 @@ from matplotlib.patches import Ellipse
 
 from mmgsd.config import N_POINTS
 from mmgsd.files import writing
+from mmgsd.match.describe import find_hidden, say_presence
 from mmgsd.match.matcher import Match
 
 METHOD_LABELS = {
@@ -30,7 +31,8 @@ METHOD_LABELS = {
     "mmgsd_long": "MMGSD, longer", "mmgsd_fine": "MMGSD, finer", "mmgsd_fine_deep": "MMGSD, finest",
     "mmgsd_muon": "MMGSD, Muon",
     "sift": "SIFT", "orb": "ORB",
-    "surf": "SURF", "akaze": "AKAZE", "daisy": "DAISY", "centre": "Object centre", "random": "Random points",
+    "surf": "SURF", "akaze": "AKAZE", "daisy": "DAISY", "imagenet": "ImageNet features",
+    "centre": "Object centre", "random": "Random points",
 }  # fmt: skip
 METHOD_COLOURS = {
     "mmgsd": "#D55E00", "spcl": "#0072B2", "pcl": "#56B4E9", "unimodal": "#009E73", "spcl_dense": "#88CCEE",
@@ -38,13 +40,15 @@ METHOD_COLOURS = {
     "mmgsd_long": "#8A3500", "mmgsd_fine": "#4D1D00", "mmgsd_fine_deep": "#260F00",
     "mmgsd_muon": "#FF3D00",
     "sift": "#CC79A7", "orb": "#999933",
-    "surf": "#882255", "akaze": "#332288", "daisy": "#E69F00", "centre": "#404040", "random": "#9A9A9A",
+    "surf": "#882255", "akaze": "#332288", "daisy": "#E69F00", "imagenet": "#117733",
+    "centre": "#404040", "random": "#9A9A9A",
 }  # fmt: skip
 CHANCE_STYLES = {"centre": "--", "random": ":"}
 COLUMN_IN, PAGE_IN = 3.5, 7.1  # widths of a column and of a page
 MARK = "#FFE100"  # the asked pixel
 
 HEAT = colormaps["inferno"](np.linspace(0.3, 1, 256))[:, :3].astype(np.float32)  # from cold to hot
+FAINT = 0.35  # opacity of modes where there is no answer
 FADED = 0.75  # brightness of an image under a heatmap
 
 _SANS = ["DejaVu Sans"]  # comes with matplotlib: the same letters everywhere
@@ -97,14 +101,19 @@ def show_answer(axis: Axes, match: Match, index: int, *, modes: bool = True) -> 
 
 
 def draw_modes(axis: Axes, match: Match, index: int) -> None:
-    """Rings at the modes of one query, their area the weight, and the 1-std ellipses."""
-    for (x, y), weight, covariance in zip(match.modes[index], match.weights[index], match.covariances[index],
-                                          strict=True):  # fmt: skip
-        if not np.isfinite(x):
-            continue
-        radii, angle = compute_ellipse(covariance)
-        axis.add_patch(Ellipse((x, y), *(2 * radii), angle=np.degrees(angle), fill=False, ec="white", lw=0.7))
-        axis.scatter(x, y, s=4 + 40 * weight, c="none", edgecolors="#00E0FF", linewidths=0.9)
+    """Rings at the modes of one query, their area the weight, and the 1-std ellipses; of hidden ones dashed.
+
+    Faint where the query has no answer (`say_presence`).
+    """
+    alpha, hidden = FAINT if say_presence(match, index) else 1.0, find_hidden(match, index)
+    for k in np.flatnonzero(np.isfinite(match.modes[index]).all(-1)):
+        radii, angle = compute_ellipse(match.covariances[index, k])
+        stroke = {"linestyle": (0, (2, 1.5)) if hidden[k] else "-", "alpha": alpha}
+        x, y = match.modes[index, k]
+        ellipse = Ellipse((x, y), *(2 * radii), angle=np.degrees(angle), fill=False, ec="white", lw=0.7, **stroke)
+        axis.add_patch(ellipse)
+        size = 4 + 40 * match.weights[index, k]
+        axis.scatter(x, y, s=size, c="none", edgecolors="#00E0FF", linewidths=0.9, **stroke)
 
 
 def compute_ellipse(covariance: np.ndarray) -> tuple[np.ndarray, float]:

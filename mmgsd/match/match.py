@@ -68,13 +68,16 @@ class Match:
     def confidence(self, *, radius_px: float = RADIUS_PX) -> np.ndarray:
         """(S, n) in [0, 1], probability that a true match lies within ``radius_px`` of each mode.
 
-        That of a round Gaussian as wide as the mode, less what the mode's weight lacks of an equal share.
+        That of a round Gaussian as wide as the mode, less what the mode's weight lacks of an equal share; times the
+        probability that the pixel asked about and image1 show the object, where that is known.
         """
         if not radius_px > 0:
             raise ValueError(f"radius_px must be greater than 0 px, got {radius_px!r}")
         present = (self.weights > 0).sum(1, keepdims=True)
         near = -np.expm1(-0.5 * np.square(radius_px / self.spread_px))
-        return np.minimum(1, present * self.weights) * np.nan_to_num(near)
+        shown = 1.0 if self.on_object is None else self.on_object[:, None]
+        shown = shown if self.absent is None else shown * (1 - self.absent[:, None])
+        return np.minimum(1, present * self.weights) * np.nan_to_num(near) * shown
 
     def best(self, *, min_confidence: float = 0.0, radius_px: float = RADIUS_PX) -> Best:
         """The mode with the least spread of each query: which of the like places to grasp (paper introduction).

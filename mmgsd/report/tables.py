@@ -26,6 +26,7 @@ LABELS = {
     "spcl_reference": "SPCL, reference setting",
     "unimodal": "Unimodal", "pcl": "PCL",
     "sift": "SIFT", "orb": "ORB", "akaze": "AKAZE", "daisy": "DAISY", "surf": "SURF",
+    "imagenet": "ImageNet features",
     "random": "random points", "centre": "object's centre",
 }  # fmt: skip
 GROUPS = {"v4": "`v4`, the flips", "c4": "`c4`, the rotations", "d4": "`d4`, all eight"}

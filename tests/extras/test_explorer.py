@@ -13,7 +13,6 @@ import pytest
 import torch
 from PIL import Image
 
-from mmgsd.__main__ import describe_answer
 from mmgsd.config import TrainConfig
 from mmgsd.dataset import load_dataset
 from mmgsd.extras.explorer import DISPLAY_PX, MOST_PINS, Explorer, prepare_baseline, show_scene
@@ -28,6 +27,7 @@ from mmgsd.extras.explorer_scenes import (
 )
 from mmgsd.learn.network import build_network
 from mmgsd.match.baselines import BaselineMatcher
+from mmgsd.match.describe import describe_answer
 from mmgsd.match.matcher import Matcher
 
 CONFIG = TrainConfig(input_px=64, descriptor_dim=4)
@@ -73,6 +73,21 @@ def test_a_click_is_answered_for_its_pixel(explorer: Explorer) -> None:
     assert json.loads(answer["json"])[0]["xy"] == [240, 200]
     assert len(answer["points"]) == 1 and len(answer["points"][0]["ellipses"]) == 4
     assert len(answer["heat"]) == np.prod(answer["heat_size"]) and max(answer["heat"]) == 255
+
+
+def test_pins_of_every_left_image_are_its_marks(explorer: Explorer) -> None:
+    one = explorer.scene.name0
+    assert tell(explorer, "ask", xy=[240, 200], pin=True) is None
+    assert tell(explorer, "ask", xy=[30, 20]) is None  # is no mark
+    explorer.open_own(0, np.zeros((50, 60, 3), np.uint8), "towel.jpg")
+    for x in (5, 6, 7, 8):
+        assert tell(explorer, "ask", xy=[x, 9.06], pin=True) is None
+    assert json.loads(explorer.pictures.marks) == [
+        {"file": one, "kind": "cloth", "visible_corners_unordered": [[240, 200]]},
+        {"file": "towel.jpg", "kind": "cloth", "corners": [[x, 9.1] for x in (5, 6, 7, 8)]},
+    ]
+    assert tell(explorer, "clear") is None
+    assert [entry["file"] for entry in json.loads(explorer.pictures.marks)] == [one]
 
 
 def test_the_saved_answer_is_what_the_command_prints(explorer: Explorer) -> None:

@@ -53,6 +53,28 @@ def test_plot_match_leaves_out_absent_modes():
     assert len(plots.plot_match(match).axes[1].patches) == 1
 
 
+def test_hidden_modes_are_dashed():
+    match = dataclasses.replace(make_match(), visible=np.array([[0.9, 0.2]]))
+    seen, hidden = plots.plot_match(match).axes[1].patches
+    assert seen.get_linestyle() == "-" and hidden.get_linestyle() != "-"
+
+
+@pytest.mark.parametrize(
+    ("known", "said"),
+    [
+        ({"absent": [0.93, 0.2]}, "absent: image1 does not show the object (93% sure)"),
+        ({"on_object": [0.2, 0.7]}, "background: the pixel is not on the object (80% sure)"),
+    ],
+)
+def test_what_has_no_answer_says_so_and_is_faint(known, said):
+    match = dataclasses.replace(make_match(2), **{name: np.array(value) for name, value in known.items()})
+    none, some = (plots.plot_match(match, k).axes[1] for k in (0, 1))
+    assert none.get_title() == said and "entropy" in some.get_title()
+    assert none.patches[0].get_alpha() < 0.5 and some.patches[0].get_alpha() == 1
+    titles = [axis.get_title() for axis in plots.plot_page(match).axes]
+    assert said.startswith(titles[1]) and titles[1] and titles[3] == "entropy 7.2 nats"
+
+
 def test_ellipse_follows_the_covariance():
     ellipse = plots.plot_match(make_match()).axes[1].patches[0]
     values, vectors = np.linalg.eigh([[9.0, 2.0], [2.0, 4.0]])
