@@ -217,8 +217,11 @@ def _read_note(archive: Path) -> dict:
 
 
 def _hash(path: Path) -> str:
+    digest = hashlib.sha256()
     with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+        while chunk := file.read(1 << 20):
+            digest.update(chunk)
+    return digest.hexdigest()
 
 
 def _read_quality(quality: int) -> int:

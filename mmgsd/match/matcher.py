@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mmgsd.config import CONTRASTIVE, ROUNDNESS, TrainConfig, find_root
+from mmgsd.config import CONTRASTIVE, ROUNDNESS, TrainConfig, find_weights
 from mmgsd.images import check_aspect, check_mask, check_pixels, to_rgb
 from mmgsd.images import read_image as read_image
 from mmgsd.learn.heads import Outputs, look_up, weigh_cells
@@ -238,17 +238,17 @@ class Pair:
 
 
 def load(weights: Path | str, *, device: str = "") -> Matcher:
-    """A `Matcher` with the weights of a file, or of a name that ``data/weights`` holds: ``"cloth"``, ``"rope-spcl"``.
+    """A `Matcher` with the weights of a file, or of a name of shipped ones: ``"cloth"``, ``"rope-spcl"``.
 
     FileNotFoundError where there are none; ValueError for a file that is damaged or not ours.
     """
-    if not Path(weights).exists():
-        folder = find_root() / "data" / "weights"
-        names = sorted(path.stem for path in folder.glob("*.safetensors"))
-        if str(weights) not in names:
-            raise FileNotFoundError(f"{weights} must be a safetensors file or one of {', '.join(map(repr, names))}")
-        weights = folder / f"{weights}.safetensors"
-    return Matcher.load(weights, device=device)
+    path = Path(weights)
+    if not path.is_file():  # a folder of a model's name does not hide the model
+        shipped = {file.stem: file for file in sorted(find_weights().glob("*.safetensors"))}
+        if str(weights) not in shipped and not path.exists():
+            raise FileNotFoundError(f"{weights} must be a safetensors file or one of {', '.join(map(repr, shipped))}")
+        path = shipped.get(str(weights), path)
+    return Matcher.load(path, device=device)
 
 
 def make_match(
