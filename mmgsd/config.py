@@ -423,7 +423,7 @@ class Paths:
         return self.root / "figures" / self.preset
 
 
-def find_weights() -> Path:
+def find_shipped() -> Path:
     """The folder of the shipped weights: within the package where it is installed, ``data/weights`` in a checkout."""
     package = Path(__file__).resolve().parent
     installed = package / "weights"

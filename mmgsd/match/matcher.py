@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mmgsd.config import CONTRASTIVE, ROUNDNESS, TrainConfig, find_weights
+from mmgsd.config import CONTRASTIVE, ROUNDNESS, TrainConfig, find_shipped
 from mmgsd.images import check_aspect, check_mask, check_pixels, to_rgb
 from mmgsd.images import read_image as read_image
 from mmgsd.learn.heads import Outputs, look_up, weigh_cells
@@ -244,7 +244,7 @@ def load(weights: Path | str, *, device: str = "") -> Matcher:
     """
     path = Path(weights)
     if not path.is_file():  # a folder of a model's name does not hide the model
-        shipped = {file.stem: file for file in sorted(find_weights().glob("*.safetensors"))}
+        shipped = {file.stem: file for file in sorted(find_shipped().glob("*.safetensors"))}
         if str(weights) not in shipped and not path.exists():
             raise FileNotFoundError(f"{weights} must be a safetensors file or one of {', '.join(map(repr, shipped))}")
         path = shipped.get(str(weights), path)
