@@ -9,6 +9,7 @@ from pathlib import Path
 
 import mmgsd
 from mmgsd import cli
+from mmgsd.command import describe_error
 from mmgsd.config import MAX_MODES
 
 EXAMPLE = "example: python -m mmgsd match towel1.jpg towel2.jpg --xy 212,148 --weights FILE --out match.png"
@@ -31,6 +32,8 @@ def main(arguments: list[str] | None = None) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (ValueError, FileNotFoundError, IsADirectoryError, PermissionError) as error:
         parser.exit(2, f"error: {cli.say_error(error)}\n")
+    except ModuleNotFoundError as error:
+        parser.exit(2, f"error: {describe_error(error)}\n")
     except (OSError, RuntimeError, MemoryError) as error:
         parser.exit(1, f"error: {cli.say_error(error)}\n")
 

@@ -423,6 +423,13 @@ class Paths:
         return self.root / "figures" / self.preset
 
 
+def find_shipped() -> Path:
+    """The folder of the shipped weights: within the package where it is installed, ``data/weights`` in a checkout."""
+    package = Path(__file__).resolve().parent
+    installed = package / "weights"
+    return installed if installed.is_dir() else package.parent / "data" / "weights"
+
+
 def find_root(start: Path | None = None) -> Path:
     """The repository's root: the nearest folder upwards that holds ``environment.lock``, or MMGSD_ROOT.
 

@@ -67,8 +67,10 @@ def decode_image(data: bytes, name: str) -> np.ndarray:
 
 def _decode(source: Path | io.BytesIO, name: str) -> np.ndarray:
     try:
-        with warnings.catch_warnings(action="ignore"), Image.open(source) as image:  # what matters of them is an error
-            return _convert(ImageOps.exif_transpose(image), name)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # what matters of them is an error
+            with Image.open(source) as image:
+                return _convert(ImageOps.exif_transpose(image), name)
     except UnidentifiedImageError as error:
         kind = "a HEIC image, which cannot" if name.lower().endswith((".heic", ".heif")) else "no image that can"
         raise ValueError(f"{name} is {kind} be read: save it as PNG, JPEG, WebP or TIFF") from error

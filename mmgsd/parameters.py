@@ -18,7 +18,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, MutableMapp
 from pathlib import Path
 from typing import Any
 
-from mmgsd.config import PRESETS, Paths, TrainConfig, find_root
+from mmgsd.config import PRESETS, Paths, TrainConfig, find_root, find_shipped
 
 Reader = Callable[[str, Any], Any]
 ADDRESS = re.compile(r"((tcp|tls|ws|wss|ucx)://)?(?P<host>\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+):(?P<port>[0-9]{1,5})")
@@ -197,7 +197,7 @@ def read_scheduler(name: str, value: Any) -> str:
 
 def read_weights(name: str, value: Any) -> str:
     """Trained weights: the name of a model in data/weights, or a safetensors file (see `find_file`)."""
-    shipped = sorted(path.stem for path in (find_root() / "data" / "weights").glob("*.safetensors"))
+    shipped = sorted(path.stem for path in find_shipped().glob("*.safetensors"))
     if value in shipped:
         return value
     try:

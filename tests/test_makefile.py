@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 from pathlib import Path
 
 import pytest
+import tomllib
+from packaging.requirements import Requirement
 
-MAKEFILE = Path(__file__).resolve().parents[1] / "Makefile"
+ROOT = Path(__file__).resolve().parents[1]
+MAKEFILE = ROOT / "Makefile"
 # Stands for Python and pip: it writes down what it was asked, and makes and empties .venv as venv does.
 PYTHON = """#!/bin/sh
 echo "$@" >> "$LOG"
@@ -116,3 +120,11 @@ def test_every_target_is_listed(checkout: Checkout) -> None:
     assert all(
         f"make {name} " in listed for name in ("reproduce", "test", "data-pack", "data-unpack", ".venv", "clean")
     )
+
+
+def test_the_lock_has_a_fitting_version_of_every_requirement_and_extra() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    asked = [*project["dependencies"], *sum(project["optional-dependencies"].values(), [])]
+    pins = dict(re.findall(r"^([\w.-]+)==([^ \\;]+)", (ROOT / "environment.lock").read_text(), re.MULTILINE))
+    for requirement in map(Requirement, asked):
+        assert requirement.specifier.contains(pins[requirement.name]), requirement

