@@ -2,7 +2,7 @@
 
 A descriptor is computed at each source pixel and at each cell of a regular grid on the target's object; a softmax over
 their distances is the heatmap from which :mod:`mmgsd.match.matcher` reads the modes. Every window is 60 to 80 px wide,
-several times the spacing of the material points. SIFT, ORB, AKAZE and SURF are turned by the image's own orientation,
+several times the spacing of the material points. SIFT, ORB and AKAZE are turned by the image's own orientation,
 estimated at each pixel as SIFT or ORB do at their keypoints; DAISY has none and stays upright.
 """
 
@@ -18,12 +18,13 @@ import skimage.feature
 import torch
 from torch import Tensor
 
+from mmgsd.config import check_choice
 from mmgsd.images import check_pixels, check_question
 from mmgsd.match.match import Match
 from mmgsd.match.matcher import make_match
 from mmgsd.match.mixture import check_modes
 
-BASELINES = ("sift", "orb", "akaze", "daisy", "surf")
+BASELINES = ("sift", "orb", "akaze", "daisy")
 BINARY = ("orb", "akaze")  # compared by Hamming distance
 STRIDE_PX = 16  # between the candidates on the object: about a cell of the trained networks
 SHARPNESS = 2.0  # logits fall by this where the squared distance grows by its std over the object
@@ -46,21 +47,14 @@ WINDOWS = {
     "sift": Window(12.8, octave=2),  # std 6.4 = 1.6 * 2**2 px, window 6 sizes
     "orb": Window(62.0, octave=1),  # the 31 px patch at half the resolution
     "akaze": Window(8.0, octave=2, level=8),  # window 10 sizes; the third octave's first of four levels
-    "surf": Window(27.0),  # window 20 scales of size * 1.2 / 9
 }
 
 
-def list_baselines() -> tuple[str, ...]:
-    """The methods that the installed OpenCV has: all, but SURF only where its non-free modules were built."""
-    return BASELINES if _has_surf() else BASELINES[:-1]
-
-
 class BaselineMatcher:
-    """Answers as `match.matcher.Matcher` does, from hand-made descriptors; ValueError for a method not at hand."""
+    """Answers as `match.matcher.Matcher` does, from hand-made descriptors; ValueError for another method."""
 
     def __init__(self, method: str, *, modes: int = 1) -> None:
-        _check_choice(method)
-        _create_extractor(method)
+        check_choice("method", method, BASELINES)
         check_modes(modes)
         self.method, self.modes = method, modes
 
@@ -97,9 +91,9 @@ def compute_baseline_heatmap(
     BASELINES. Returns the heatmap (S, h, w) float32, which sums to 1 and is 0 off the object, and the cells' centres
     (h, w, 2) px: cell (i, j) lies at ``(stride - 1) / 2 + stride * (j, i)``. The heatmap is softmax(-d² / 2τ²) over
     the object's cells, d the descriptors' L2 or Hamming distance, 2τ² a query's own std of d² divided by SHARPNESS.
-    Raises ValueError for other arguments, a mask without any cell, or ``surf`` in an OpenCV built without it.
+    Raises ValueError for other arguments or a mask without any cell.
     """
-    _check_choice(method)
+    check_choice("method", method, BASELINES)
     _check_image("image0", image0)
     _check_image("image1", image1)
     xy = check_pixels(xy, image0.shape[1::-1])
@@ -125,7 +119,7 @@ def compute_descriptors(image: np.ndarray, xy: np.ndarray, *, method: str) -> np
 
     Raises ValueError for another image, an unknown method, or one that the installed OpenCV lacks.
     """
-    _check_choice(method)
+    check_choice("method", method, BASELINES)
     _check_image("image", image)
     xy = check_pixels(xy, image.shape[1::-1], image="the image")
     grey = np.pad(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), PAD_PX, mode="symmetric")
@@ -179,16 +173,7 @@ def _describe_keypoints(grey: np.ndarray, xy: np.ndarray, method: str) -> np.nda
     return descriptors.astype(np.float32)
 
 
-def _has_surf() -> bool:
-    return hasattr(getattr(cv2, "xfeatures2d", None), "SURF_create")
-
-
 def _create_extractor(method: str) -> cv2.Feature2D:
-    if method == "surf":
-        if not _has_surf():
-            raise ValueError("method 'surf' needs an OpenCV with its non-free modules, got one without; accepted here: "
-                             + ", ".join(map(repr, BASELINES[:-1])))  # fmt: skip
-        return cv2.xfeatures2d.SURF_create()
     if method == "orb":
         return cv2.ORB_create(scaleFactor=2.0, nlevels=2, edgeThreshold=0)
     return cv2.AKAZE_create() if method == "akaze" else cv2.SIFT_create()
@@ -250,11 +235,6 @@ def _sample_mask(mask: np.ndarray, image: np.ndarray, grid: np.ndarray) -> np.nd
     if not inside.any():
         raise ValueError("mask1 must hold at least one cell of the grid, got none: is the object in the image?")
     return inside
-
-
-def _check_choice(method: str) -> None:
-    if method not in BASELINES:
-        raise ValueError(f"method must be one of {', '.join(map(repr, BASELINES))}, got {method!r}")
 
 
 def _check_image(name: str, image: np.ndarray) -> None:
