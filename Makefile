@@ -56,7 +56,7 @@ unit: $(STAMP) ## Run the tests in tests/
 # run_all would run every notebook a second time: a test in tests/ runs it through papermill.
 notebooks-test: $(STAMP) ## Run the notebooks and compare their outputs with the committed ones
 	$(PY) -m pytest --nbval --nbval-current-env --nbval-cell-timeout=600 \
-		--nbval-sanitize-with=tests/nbval_sanitize.cfg notebooks/0*.ipynb notebooks/explore.ipynb notebooks/your_*.ipynb
+		--nbval-sanitize-with=tests/nbval_sanitize.cfg notebooks/[01]*.ipynb notebooks/explore.ipynb notebooks/your_*.ipynb
 
 figures: $(STAMP) ## Draw the paper's figures of PRESET (paper) again from data/results, without training
 	@mkdir -p data/generated

@@ -14,7 +14,6 @@ import math
 import numbers
 import os
 import re
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -33,18 +32,8 @@ CONTRASTIVE_REVISION = "r2"  # of PCL's and SPCL's training, to be raised with i
 PASSES = {"lite0": 1, "lite0x2": 2, "lite0x2fine": 2}  # over the feature pyramid
 DETAILED = ("lite0x2fine",)  # whose trunk sees the image at half its size, a light branch at the whole
 NETWORKS = (*PASSES, "resnet34")  # the last is the contrastive papers' reference
-CONTRASTIVE_MARGIN = 4.0  # of the presets: with the reference's 0.5, lite0's descriptors collapse before they learn
-LONGER = 3  # times the steps of the main table: a model of its own, to see what more training gains
 ROUNDNESS = 0.2  # heatmap mass by which modes are a priori round and equally wide
 MAX_MODES = 64  # that can be asked for: more than any symmetry of the objects has, and few enough to fit in a moment
-ROUNDNESS_OF_SHARP = 0.05  # with which the sharper heatmaps of "mmgsd_muon" have the least error held out
-FINER = 1.5  # times the input, at least, on which another goes on from there
-LONGER_TRAINED = ("mmgsd_long", "mmgsd_fine", "mmgsd_fine_deep", "mmgsd_muon")  # the 2nd and 3rd go on from the 1st
-REFERENCE = {  # Dense Object Nets' training (Florence et al. 2018): 3,500 steps of a pair of images as they are
-    "network": "resnet34", "descriptor_dim": 3, "roles": 1, "batch": 2, "pairs": 1, "queries": 625, "margin": 0.5,
-    "learning_rate": 1e-4, "schedule": "step", "weight_decay": 1e-4, "bend": 0.0, "augment": False,
-}  # fmt: skip
-OWN_STEPS = ("spcl_reference", *LONGER_TRAINED)  # models of the main table with another number of steps than the rest
 OPTIMISERS = ("adamw", "muon")
 ADDED = {"optimiser": "adamw", "roundness": 0.2, "scene": "plain", "heads": False, "clutter": False,
          "also": ""}  # later fields, and how it was done without them  # fmt: skip
@@ -71,7 +60,8 @@ def _check_object(name: str) -> None:
            f"{name + '2'!r}, for example", not taken)  # fmt: skip
 
 
-def _check_choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
+def check_choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
+    """ValueError that names the argument and the choices, the nearest one too, where ``value`` is none of them."""
     close = difflib.get_close_matches(str(value), choices, n=1)
     hint = f" (did you mean {close[0]!r}?)" if close else ""
     _check(name, value, f"one of {', '.join(map(repr, choices))}{hint}", value in choices)
@@ -137,7 +127,7 @@ class RenderConfig:
             _check(name, getattr(self, name), "at least 1", getattr(self, name) >= 1)
         _check("rotation_deg", self.rotation_deg, "in (0, 180]", 0 < self.rotation_deg <= 180)
         _check("ball", self.ball, "False for a cloth", not self.ball or self.object == "rope")
-        _check_choice("scene", self.scene, SCENES)
+        check_choice("scene", self.scene, SCENES)
         _check("seed", self.seed, "at least 0", self.seed >= 0)
 
     @property
@@ -186,10 +176,10 @@ class TrainConfig:
     def __post_init__(self) -> None:
         _check_types(self)
         _check_object(self.object)
-        _check_choice("method", self.method, METHODS)
-        _check_choice("network", self.network, NETWORKS)
-        _check_choice("optimiser", self.optimiser, OPTIMISERS)
-        _check_choice("schedule", self.schedule, ("cosine", "step"))
+        check_choice("method", self.method, METHODS)
+        check_choice("network", self.network, NETWORKS)
+        check_choice("optimiser", self.optimiser, OPTIMISERS)
+        check_choice("schedule", self.schedule, ("cosine", "step"))
         _set_frozen(self, "group", self.group or DEFAULT_GROUP.get(self.object, OWN_GROUP))
         weight = self.prototype_weight
         _check("prototype_weight", weight, "at least 0, or -1 for the method's own", weight >= 0 or weight == -1)
@@ -210,7 +200,7 @@ class TrainConfig:
             _check(name, getattr(self, name), "at least 0", getattr(self, name) >= 0)
         _check("heads", self.heads, f"False for {self.network!r}", not self.heads or self.network in PASSES)
         if self.also:
-            _check_choice("also", self.also, tuple(PRESETS))
+            check_choice("also", self.also, tuple(PRESETS))
 
     @property
     def dense_weight(self) -> float:
@@ -250,63 +240,6 @@ class Preset:
     ablation: dict[str, TrainConfig]  # the equal, smaller budget of the studies
     sigmas_px: tuple[float, ...]
 
-    def method(self, object: str, method: str) -> TrainConfig:
-        """The training configuration of one model of the main table; ValueError for a name that it does not have."""
-        models = self.main_table(object)
-        _check_choice("method", method, tuple(models))
-        return models[method]
-
-    def main_table(self, object: str) -> dict[str, TrainConfig]:
-        """The models of the main table by the names they have in it.
-
-        The four methods differ in the loss and its margin alone. Beside them, "spcl_dense": SPCL with the dense
-        supervision that MMGSD gets; "spcl_reference": SPCL as Dense Object Nets are trained (`REFERENCE`), its images
-        twice as large for cells of the same size; "mmgsd_plain": MMGSD without the dense supervision; "mmgsd_deep" and
-        "spcl_deep": MMGSD, and SPCL with the dense supervision, in a network with a second pass over its pyramid;
-        "mmgsd_long": MMGSD with `LONGER` times the steps; "mmgsd_fine": the latter after a quarter as many steps more,
-        on larger images, with the method's own loss alone; "mmgsd_fine_deep": that one after as many again, with the
-        second pass put onto it; "mmgsd_muon": from the start with both passes, a light branch that sees the image at
-        twice the size, another optimiser, and modes read with less of a prior, `LONGER` times the steps.
-        """
-        train = self.train[object]
-        models = {method: dataclasses.replace(train, method=method) for method in METHODS}
-        models |= {m: dataclasses.replace(models[m], margin=CONTRASTIVE_MARGIN) for m in CONTRASTIVE}
-        twice, sharp = {"input_px": 2 * train.input_px}, {"roundness": ROUNDNESS_OF_SHARP}
-        reference = {**twice, "steps": max(1, train.steps * 7 // 8), **REFERENCE}
-        longer = dataclasses.replace(models["mmgsd"], steps=LONGER * train.steps)
-        finer = {"input_px": math.ceil(FINER * train.input_px / 32) * 32, "steps": max(1, longer.steps // 4)}
-        gentler = {"learning_rate": train.learning_rate / 2, "sigma_start_px": 8.0, "prototype_weight": 0.0}
-        fine = dataclasses.replace(longer, trunk_weights=longer.name, **finer, **gentler)
-        return models | {
-            "spcl_dense": dataclasses.replace(models["spcl"], prototype_weight=1.0),
-            "mmgsd_plain": dataclasses.replace(models["mmgsd"], prototype_weight=0.0),
-            "mmgsd_deep": dataclasses.replace(models["mmgsd"], network="lite0x2"),
-            "spcl_deep": dataclasses.replace(models["spcl"], prototype_weight=1.0, network="lite0x2"),
-            "spcl_reference": dataclasses.replace(train, method="spcl", **reference),
-            "mmgsd_long": longer,
-            "mmgsd_fine": fine,
-            "mmgsd_fine_deep": dataclasses.replace(fine, trunk_weights=fine.name, network="lite0x2"),
-            "mmgsd_muon": dataclasses.replace(longer, network="lite0x2fine", optimiser="muon", **twice, **sharp),
-        }
-
-    def budget_table(self, object: str) -> dict[str, TrainConfig]:
-        """The same models at the smaller budget of the studies, which is one: without those of their own number."""
-        models = dataclasses.replace(self, train=self.ablation).main_table(object)
-        return {method: model for method, model in models.items() if method not in OWN_STEPS}
-
-    def sigma_table(self, object: str, sigmas_px: Sequence[float] = (), *, steps: int = 0) -> dict[str, TrainConfig]:
-        """MMGSD with each σ, of the preset where ``sigmas_px`` names none: {"4": …}; 0 ``steps`` are that budget's."""
-        chosen = sorted({float(sigma) for sigma in sigmas_px or self.sigmas_px})
-        budget = self.ablation[object]
-        models = {sigma: dataclasses.replace(budget, sigma_px=sigma, steps=steps or budget.steps) for sigma in chosen}
-        return {f"{sigma:g}": model for sigma, model in models.items()}
-
-    def seed_table(self, object: str, seeds: Sequence[int], *, steps: int = 0) -> dict[str, TrainConfig]:
-        """The four methods with each seed: {"mmgsd-0": …, "mmgsd-1": …}; 0 ``steps`` are the main table's."""
-        models = {method: self.method(object, method) for method in METHODS}
-        models = {m: dataclasses.replace(model, steps=steps or model.steps) for m, model in models.items()}
-        return {f"{m}-{s}": dataclasses.replace(models[m], seed=s) for m in models for s in sorted(set(seeds))}
-
 
 def _preset(
     name: str, *, views: dict, train: dict, rope: dict, ablation: dict, evaluate: dict, sigmas: tuple, **render: Any
@@ -325,7 +258,7 @@ def _preset(
 
 def load_preset(name: str) -> Preset:
     """The preset ``smoke``, ``quick``, ``paper`` or ``workspace``; ValueError for any other name."""
-    _check_choice("preset", name, tuple(PRESETS))
+    check_choice("preset", name, tuple(PRESETS))
     return PRESETS[name]
 
 
@@ -384,7 +317,7 @@ def from_dict(kind: type[Config], values: dict[str, Any]) -> Config:
     """Build a configuration from stored values; an unknown key is a ValueError that names the accepted ones."""
     known = [field.name for field in dataclasses.fields(kind)]
     for key in values:
-        _check_choice(f"a key of {kind.__name__}", key, tuple(known))
+        check_choice(f"a key of {kind.__name__}", key, tuple(known))
     return kind(**values)
 
 

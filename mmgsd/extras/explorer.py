@@ -22,8 +22,9 @@ import cv2
 import numpy as np
 import traitlets
 
+from mmgsd.experiments import get_label
 from mmgsd.extras.explorer_scenes import Scene
-from mmgsd.figures.style import FADED, HEAT, METHOD_LABELS, compute_ellipse, compute_strength, fade_image
+from mmgsd.figures.style import FADED, HEAT, compute_ellipse, compute_strength, fade_image
 from mmgsd.images import decode_image
 from mmgsd.match.baselines import FeatureMatcher
 from mmgsd.match.describe import describe_answer
@@ -69,7 +70,7 @@ class Explorer:
             raise ValueError("matchers and scenes must not be empty")
         self.matchers, self.scenes, self.pairs_opened, self.answers = dict(matchers), list(scenes), 0, 0
         self.rng, self._own, self._parts, self.marks = np.random.default_rng(), None, {}, {}
-        methods = [[name, METHOD_LABELS.get(name, name)] for name in self.matchers]
+        methods = [[name, get_label(name, short=True)] for name in self.matchers]
         self.pictures = Pictures(methods=methods, method=methods[0][0])
         self.pictures.on_msg(self._on_message)
         self.open(0)

@@ -22,7 +22,7 @@ from mmgsd.figures.style import (
     mark_pixel,
     styled,
 )
-from mmgsd.match.matcher import Match
+from mmgsd.match.match import Match
 
 FEW_PAIRS = 5  # of images: their mean says as much of them as of their states
 TRUE = "#00FF6A"  # the sign of true matches

@@ -16,11 +16,10 @@ from matplotlib.figure import Figure
 from scipy.ndimage import gaussian_filter1d
 
 from mmgsd.config import N_POINTS
+from mmgsd.experiments import ROWS, get_colour, get_label
 from mmgsd.figures.style import (
     COLUMN_IN,
     MARK,
-    METHOD_COLOURS,
-    METHOD_LABELS,
     PAGE_IN,
     add_legend,
     blend_heatmap,
@@ -36,7 +35,7 @@ from mmgsd.figures.style import (
     styled,
 )
 from mmgsd.match.describe import say_presence
-from mmgsd.match.matcher import Match
+from mmgsd.match.match import Match
 from mmgsd.measure.metrics import BIN_PX, ErrorSummary
 
 _ORBIT_COLOURS = ("#D55E00", "#56B4E9", "#FFE100", "#009E73")
@@ -198,7 +197,7 @@ def plot_spatial_rmse(
     maps = [errors["cloth"][method].mean_px.reshape(25, 25) for method in mapped]
     for axis, method, values in zip(axes[1:], mapped, maps, strict=True):
         image = axis.imshow(values, cmap=colormaps["viridis"].with_extremes(bad="0.85"), vmin=0, vmax=np.nanmax(maps))
-        axis.set(title=f"Cloth · {METHOD_LABELS[method]}", xticks=[0, 12, 24], yticks=[0, 12, 24])
+        axis.set(title=f"Cloth · {get_label(method, short=True)}", xticks=[0, 12, 24], yticks=[0, 12, 24])
     axes[1].set(xlabel="Column of the grid", ylabel="Row of the grid")
     figure.colorbar(image, ax=axes[1:], label="RMSE (px)", shrink=0.8)
     add_legend(figure, axes[:1])
@@ -214,7 +213,7 @@ def plot_sigma_ablation(results: Mapping[str, Mapping[str, Mapping[str, float]]]
     for axis, (name, rows) in zip(axes[0], results.items(), strict=True):
         points = sorted((float(sigma), metrics["rmse_mean"]) for sigma, metrics in rows.items())
         sigma, error = zip(*points, strict=True)
-        axis.plot(sigma, error, "o-", ms=3.5, color=METHOD_COLOURS["mmgsd"])
+        axis.plot(sigma, error, "o-", ms=3.5, color=get_colour("mmgsd"))
         for x, y in points:
             axis.annotate(f"{y:.1f}", (x, y), xytext=(0, 4), textcoords="offset points", ha="center", fontsize=6.5)
         axis.set_xscale("log", base=2)
@@ -237,10 +236,10 @@ def plot_training(logs: Mapping[str, pd.DataFrame], *, columns: int = 4) -> Figu
     figure, axes = plt.subplots(rows, columns, figsize=(PAGE_IN * columns / 4, 1.5 * rows), layout="constrained",
                                 squeeze=False)  # fmt: skip
     for axis, (name, log) in zip(axes.flat, logs.items(), strict=False):
-        colour = METHOD_COLOURS.get(name.split()[-1], "0.3")
+        colour = get_colour(name.split()[-1])
         axis.plot(log.step, log.loss, color=colour, alpha=0.3, lw=0.6)
         axis.plot(log.step, log.loss.rolling(max(1, len(log) // 10), min_periods=1).mean(), color=colour)
-        title = " ".join(METHOD_LABELS.get(word, word.capitalize()) for word in name.split())
+        title = " ".join(get_label(word, short=True) if word in ROWS else word.capitalize() for word in name.split())
         axis.set(title=f"{title} · {log.seconds.iloc[-1] / 60:.1f} min", xlabel="Step")
     for axis in axes[:, 0]:
         axis.set_ylabel("Loss")

@@ -1,7 +1,7 @@
-"""What the figures share: colours and names of the methods, style, panels that show images, and saving.
+"""What the figures share: style, lines of the methods, panels that show images, and saving.
 
 Sizes are those of a two-column paper (3.5 and 7.1 in), colours those of Okabe and Ito, which colour-blind readers tell
-apart; one method has one colour in every figure.
+apart; one method has one colour in every figure (`mmgsd.experiments`).
 """
 
 from __future__ import annotations
@@ -20,29 +20,11 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from mmgsd.config import N_POINTS
+from mmgsd.experiments import get_colour, get_label
 from mmgsd.files import writing
 from mmgsd.match.describe import find_hidden, say_presence
-from mmgsd.match.matcher import Match
+from mmgsd.match.match import Match
 
-METHOD_LABELS = {
-    "mmgsd": "MMGSD", "spcl": "SPCL", "pcl": "PCL", "unimodal": "Unimodal", "spcl_dense": "SPCL, dense",
-    "mmgsd_plain": "MMGSD, plain", "mmgsd_deep": "MMGSD, deeper", "spcl_deep": "SPCL, deeper",
-    "spcl_reference": "SPCL, reference",
-    "mmgsd_long": "MMGSD, longer", "mmgsd_fine": "MMGSD, finer", "mmgsd_fine_deep": "MMGSD, finest",
-    "mmgsd_muon": "MMGSD, Muon",
-    "sift": "SIFT", "orb": "ORB",
-    "surf": "SURF", "akaze": "AKAZE", "daisy": "DAISY", "imagenet": "ImageNet features",
-    "centre": "Object centre", "random": "Random points",
-}  # fmt: skip
-METHOD_COLOURS = {
-    "mmgsd": "#D55E00", "spcl": "#0072B2", "pcl": "#56B4E9", "unimodal": "#009E73", "spcl_dense": "#88CCEE",
-    "mmgsd_plain": "#F0A070", "mmgsd_deep": "#B22222", "spcl_deep": "#4477CC", "spcl_reference": "#001F4D",
-    "mmgsd_long": "#8A3500", "mmgsd_fine": "#4D1D00", "mmgsd_fine_deep": "#260F00",
-    "mmgsd_muon": "#FF3D00",
-    "sift": "#CC79A7", "orb": "#999933",
-    "surf": "#882255", "akaze": "#332288", "daisy": "#E69F00", "imagenet": "#117733",
-    "centre": "#404040", "random": "#9A9A9A",
-}  # fmt: skip
 CHANCE_STYLES = {"centre": "--", "random": ":"}
 COLUMN_IN, PAGE_IN = 3.5, 7.1  # widths of a column and of a page
 MARK = "#FFE100"  # the asked pixel
@@ -151,7 +133,7 @@ def fade_image(image: np.ndarray) -> np.ndarray:
 
 def get_line_style(method: str) -> dict:
     """Label, colour and stroke of a method's line; chance is broken, MMGSD on top."""
-    style = {"label": METHOD_LABELS.get(method, method), "color": METHOD_COLOURS.get(method, "0.5")}
+    style = {"label": get_label(method, short=True), "color": get_colour(method)}
     return style | {"linestyle": CHANCE_STYLES.get(method, "-"), "zorder": 4 if method == "mmgsd" else 2}
 
 

@@ -36,8 +36,6 @@ from mmgsd.learn.checkpoints import (
     write_checkpoint,
     write_tensors,
 )
-from mmgsd.learn.checkpoints import describe_run as describe_run  # what others ask of a training
-from mmgsd.learn.checkpoints import load_metadata as load_metadata
 from mmgsd.learn.network import build_network, find_device, sample_descriptors
 from mmgsd.learn.objective import compute_head_loss, compute_loss
 from mmgsd.learn.optimiser import make_optimisers

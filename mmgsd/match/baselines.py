@@ -3,7 +3,7 @@ others, and dense features of any network by nearest neighbours, such as ImageNe
 
 A descriptor is computed at each source pixel and at each cell of a regular grid on the target's object; a softmax over
 their distances is the heatmap from which :mod:`mmgsd.match.matcher` reads the modes. Every window is 60 to 80 px wide,
-several times the spacing of the material points. SIFT, ORB, AKAZE and SURF are turned by the image's own orientation,
+several times the spacing of the material points. SIFT, ORB and AKAZE are turned by the image's own orientation,
 estimated at each pixel as SIFT or ORB do at their keypoints; DAISY has none and stays upright.
 """
 
@@ -21,13 +21,14 @@ import skimage.feature
 import torch
 from torch import Tensor
 
+from mmgsd.config import check_choice
 from mmgsd.images import check_pixels, check_question
 from mmgsd.match.features import Extractor, extract_imagenet, sample_features
 from mmgsd.match.match import Match
 from mmgsd.match.matcher import make_match
 from mmgsd.match.mixture import check_modes
 
-BASELINES = ("sift", "orb", "akaze", "daisy", "imagenet", "surf")
+BASELINES = ("sift", "orb", "akaze", "daisy", "imagenet")
 BINARY = ("orb", "akaze")  # compared by Hamming distance
 STRIDE_PX = 16  # between the candidates on the object: about a cell of the trained networks
 SHARPNESS = 2.0  # logits fall by this where the squared distance grows by its std over the object
@@ -50,13 +51,7 @@ WINDOWS = {
     "sift": Window(12.8, octave=2),  # std 6.4 = 1.6 * 2**2 px, window 6 sizes
     "orb": Window(62.0, octave=1),  # the 31 px patch at half the resolution
     "akaze": Window(8.0, octave=2, level=8),  # window 10 sizes; the third octave's first of four levels
-    "surf": Window(27.0),  # window 20 scales of size * 1.2 / 9
 }
-
-
-def list_baselines() -> tuple[str, ...]:
-    """The methods that the installed OpenCV has: all, but SURF only where its non-free modules were built."""
-    return BASELINES if _has_surf() else BASELINES[:-1]
 
 
 class FeatureMatcher:
@@ -102,9 +97,7 @@ class BaselineMatcher(FeatureMatcher):
     """The same of a method in `BASELINES`; ValueError for one not at hand."""
 
     def __init__(self, method: str, *, modes: int = 1) -> None:
-        _check_choice(method)
-        if method != "imagenet":
-            _create_extractor(method)
+        check_choice("method", method, BASELINES)
         super().__init__(extract_imagenet, modes=modes)
         self.method = method
 
@@ -118,9 +111,9 @@ def compute_baseline_heatmap(
 ) -> tuple[np.ndarray, np.ndarray]:
     """`compute_described_heatmap` of a method in BASELINES.
 
-    ValueError for another, also for ``surf`` in an OpenCV built without it.
+    ValueError for another.
     """
-    _check_choice(method)
+    check_choice("method", method, BASELINES)
     describe = partial(compute_descriptors, method=method)
     return compute_described_heatmap(image0, image1, xy, mask1, describe=describe, stride=stride)
 
@@ -162,7 +155,7 @@ def compute_descriptors(image: np.ndarray, xy: np.ndarray, *, method: str) -> np
 
     Raises ValueError for another image, an unknown method, or one that the installed OpenCV lacks.
     """
-    _check_choice(method)
+    check_choice("method", method, BASELINES)
     _check_image("image", image)
     xy = check_pixels(xy, image.shape[1::-1], image="the image")
     if method == "imagenet":
@@ -218,16 +211,7 @@ def _describe_keypoints(grey: np.ndarray, xy: np.ndarray, method: str) -> np.nda
     return descriptors.astype(np.float32)
 
 
-def _has_surf() -> bool:
-    return hasattr(getattr(cv2, "xfeatures2d", None), "SURF_create")
-
-
 def _create_extractor(method: str) -> cv2.Feature2D:
-    if method == "surf":
-        if not _has_surf():
-            raise ValueError("method 'surf' needs an OpenCV with its non-free modules, got one without; accepted here: "
-                             + ", ".join(map(repr, BASELINES[:-1])))  # fmt: skip
-        return cv2.xfeatures2d.SURF_create()
     if method == "orb":
         return cv2.ORB_create(scaleFactor=2.0, nlevels=2, edgeThreshold=0)
     return cv2.AKAZE_create() if method == "akaze" else cv2.SIFT_create()
@@ -289,11 +273,6 @@ def _sample_mask(mask: np.ndarray, image: np.ndarray, grid: np.ndarray) -> np.nd
     if not inside.any():
         raise ValueError("mask1 must hold at least one cell of the grid, got none: is the object in the image?")
     return inside
-
-
-def _check_choice(method: str) -> None:
-    if method not in BASELINES:
-        raise ValueError(f"method must be one of {', '.join(map(repr, BASELINES))}, got {method!r}")
 
 
 def _check_image(name: str, image: np.ndarray) -> None:

@@ -18,11 +18,9 @@ from torch import Tensor
 
 from mmgsd.config import CONTRASTIVE, ROUNDNESS, TrainConfig, find_shipped
 from mmgsd.images import check_aspect, check_mask, check_pixels, to_rgb
-from mmgsd.images import read_image as read_image
 from mmgsd.learn.heads import Outputs, look_up, weigh_cells
 from mmgsd.learn.losses import compute_squared_distances
 from mmgsd.learn.network import compute_cell_centres, find_device, fit_input_size, sample_descriptors
-from mmgsd.match.match import Best as Best
 from mmgsd.match.match import Match
 from mmgsd.match.mixture import Mixture, check_count, check_modes, fit_modes, keep_most_probable
 from mmgsd.match.weights import read_weights

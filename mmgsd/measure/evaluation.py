@@ -20,12 +20,11 @@ from mmgsd.dataset_format import UNREADABLE
 from mmgsd.files import DamagedFileError, read_json, saying_what_stays, set_aside, write_json, writing
 from mmgsd.learn.heads import Outputs
 from mmgsd.learn.network import compute_cell_centres
-from mmgsd.match.baselines import BaselineMatcher, list_baselines
+from mmgsd.match.baselines import BASELINES, BaselineMatcher
 from mmgsd.match.matcher import Matcher, check_scales, read_heatmap
 from mmgsd.match.mixture import Mixture, check_modes
 from mmgsd.measure.metrics import aggregate, compute_mahalanobis2, compute_query_errors
 
-BASELINES = list_baselines()  # hand-made descriptors that this OpenCV has
 CHANCE = ("centre", "random")
 BANDWIDTHS = (1 / 64, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2)  # of a contrastive heatmap, in margins
 MEASURES = "2"  # to be raised where the same answers are measured in another way

@@ -21,7 +21,7 @@ RANKED = 0.3  # rank correlation from which entropy is said to rank the errors
 NATS = 0.05  # entropies that differ by less are not told apart: 5 % of the area
 SPCL = ("spcl", "spcl_dense")  # the paper's, and the one with the dense supervision that MMGSD gets
 PLAIN = ("edge", "interior")  # of a cloth: where the groups differ
-HAND_MADE = ("sift", "surf", "orb")  # that the paper names
+HAND_MADE = ("sift", "surf", "orb")  # that the paper names; SURF is not in the OpenCV that pip installs
 
 
 @dataclass(frozen=True)

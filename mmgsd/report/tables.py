@@ -11,25 +11,14 @@ from pathlib import Path
 from typing import Any
 
 from mmgsd.command import run_command
-from mmgsd.config import LONGER
+from mmgsd.experiments import MODELS, UNTRAINED, get_label
 from mmgsd.files import DamagedFileError, read_json, write_text
 
 REMEDY = "restore it (it may be in git), or run its notebook again"
 
 PAPER = {"cloth": 32.4, "rope": 31.3}  # px, MMGSD's RMSE as the paper reports it
-LABELS = {
-    "mmgsd": "**MMGSD** (ours)", "mmgsd_deep": "MMGSD, deeper network", "mmgsd_long": f"MMGSD, {LONGER} × the steps",
-    "mmgsd_fine": "MMGSD, then larger images", "mmgsd_fine_deep": "MMGSD, then deeper network",
-    "mmgsd_muon": "MMGSD, Muon, detail branch",
-    "mmgsd_plain": "MMGSD, own loss alone",
-    "spcl_deep": "SPCL, dense, deeper network", "spcl_dense": "SPCL, dense supervision", "spcl": "SPCL",
-    "spcl_reference": "SPCL, reference setting",
-    "unimodal": "Unimodal", "pcl": "PCL",
-    "sift": "SIFT", "orb": "ORB", "akaze": "AKAZE", "daisy": "DAISY", "surf": "SURF",
-    "imagenet": "ImageNet features",
-    "random": "random points", "centre": "object's centre",
-}  # fmt: skip
-GROUPS = {"v4": "`v4`, the flips", "c4": "`c4`, the rotations", "d4": "`d4`, all eight"}
+TABLED = ("main", "robustness", "hand_made", "chance")
+LABELS = {row.name: row.label for row in (*MODELS, *UNTRAINED) if {*row.studies} & {*TABLED}}  # rows in their order
 
 Errors = dict[str, dict[str, dict[str, float]]]  # {object: {method, or σ: {metric: value}}}
 
@@ -81,7 +70,7 @@ def make_symmetry_table(results: dict[str, dict[str, Any]]) -> str:
     lines = ["| taught and asked | all | corners | edges | interior |", "|---|---|---|---|---|"]
     for group, row in results.items():
         errors = [row["rmse_mean"], *(row["regions"][region]["rmse_px"] for region in ("corner", "edge", "interior"))]
-        lines.append(f"| {GROUPS.get(group, f'`{group}`')} | {' | '.join(f'{error:.1f}' for error in errors)} |")
+        lines.append(f"| {get_label(group)} | {' | '.join(f'{error:.1f}' for error in errors)} |")
     return "\n".join(lines)
 
 
@@ -100,7 +89,7 @@ def _make_lines(first: str, results: Errors, labels: dict[str, str]) -> list[str
     lines = [f"| {first}".rstrip() + f" | {' | '.join(heads)} |", "|---" * 7 + "|"]
     for key, label in labels.items():
         rows = [results.get(object, {}).get(key) for object in PAPER]
-        if any(rows):  # SURF is not in every OpenCV
+        if any(rows):
             cells = [_format_errors(row) if row else "– | – | –" for row in rows]
             lines.append(f"| {label} | {' | '.join(cells)} |")
     return lines
@@ -179,6 +168,7 @@ MARKED = re.compile(
 TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "paper": ("paper/rmse.json", make_results_table),
     "budget": ("paper/budget.json", make_budget_table),
+    "robustness": ("paper/robustness.json", make_budget_table),
     "sigma": ("paper/sigma.json", make_sigma_table),
     "sigma_4000": ("paper/sigma_4000.json", make_sigma_table),
     "symmetry": ("paper/symmetry.json", make_symmetry_table),
@@ -196,9 +186,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m mmgsd.report.tables", description=__doc__)
     parser.add_argument("results", type=Path, help="the folder of results, data/results")
     parser.add_argument("documents", type=Path, nargs="+", help="Markdown files that mark tables")
-    asked = parser.parse_args()
-    for document in asked.documents:
-        update_tables(document, asked.results)
+    args = parser.parse_args()
+    for document in args.documents:
+        update_tables(document, args.results)
 
 
 if __name__ == "__main__":

@@ -9,9 +9,10 @@ import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 
+from mmgsd.experiments import get_colour
 from mmgsd.figures import plots
 from mmgsd.figures import style as drawing
-from mmgsd.match.matcher import Match
+from mmgsd.match.match import Match
 from mmgsd.measure.metrics import BIN_PX, ErrorSummary, summarise_errors
 
 
@@ -161,7 +162,7 @@ def test_plot_rmse_pdf_draws_visible_queries_in_percent():
         assert found == pytest.approx(peaks, abs=BIN_PX)
     assert figure.axes[0].get_xlim()[1] == pytest.approx(80, abs=2 * BIN_PX)  # most of all errors are shown
     assert [line.get_linestyle() for line in figure.axes[0].lines] == ["-", "-", "--"]
-    assert figure.axes[0].lines[0].get_color() == drawing.METHOD_COLOURS["mmgsd"]
+    assert figure.axes[0].lines[0].get_color() == get_colour("mmgsd")
 
 
 @pytest.mark.parametrize("points", [625, 25])
@@ -279,5 +280,6 @@ def test_empty_input_is_an_error(call):
 def test_no_figure_stays_open():
     from matplotlib import pyplot
 
+    before = pyplot.get_fignums()  # of other tests
     plots.plot_sigma_ablation({"cloth": {"1": {"rmse_mean": 1.0}}})
-    assert pyplot.get_fignums() == []
+    assert pyplot.get_fignums() == before

@@ -18,8 +18,8 @@ from safetensors import safe_open
 
 from mmgsd.config import TrainConfig
 from mmgsd.learn import training
+from mmgsd.learn.checkpoints import CHECKPOINT
 from mmgsd.learn.distributed import Team, joined
-from mmgsd.learn.training import CHECKPOINT
 
 CONFIG = TrainConfig(steps=3, batch=4, groups=2, pairs=4, queries=16, input_px=64, descriptor_dim=8)
 SCRIPT = """

@@ -1,4 +1,3 @@
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -14,10 +13,8 @@ from mmgsd.match.baselines import (
     compute_distances,
     compute_grid,
     compute_orientations,
-    list_baselines,
 )
 
-HERE = BASELINES[:-1]  # SURF is not in every OpenCV
 SIZE = (240, 200)  # width, height
 STRIDE = 8  # px, finer than the default: the image is small
 CENTRE = np.array([119.5, 99.5])
@@ -52,7 +49,7 @@ def turn(image, xy, degrees):
     return turned, np.c_[xy, np.ones(len(xy))] @ matrix.T
 
 
-@pytest.mark.parametrize("method", HERE)
+@pytest.mark.parametrize("method", BASELINES)
 def test_heatmap_is_a_distribution_on_the_object(method, image, mask, xy):
     half = mask.copy()
     half[:, :100] = False
@@ -65,7 +62,7 @@ def test_heatmap_is_a_distribution_on_the_object(method, image, mask, xy):
     assert not heatmap[:, grid[..., 0] < 99].any()
 
 
-@pytest.mark.parametrize("method", HERE)
+@pytest.mark.parametrize("method", BASELINES)
 def test_an_image_matches_itself(method, image, mask, xy):
     heatmap, grid = compute_baseline_heatmap(image, image, xy, mask, method=method, stride=STRIDE)
     errors = np.linalg.norm(find_top(heatmap, grid) - xy, axis=1)
@@ -101,7 +98,7 @@ def test_orientation_of_a_ramp_is_its_gradient(method, tolerance):
     assert got[0] == pytest.approx(33, abs=tolerance)  # SIFT's bins are 10 degrees wide
 
 
-@pytest.mark.parametrize("method", HERE)
+@pytest.mark.parametrize("method", BASELINES)
 def test_no_point_is_dropped_at_the_border(method, image):
     corners = np.array([[-0.5, -0.5], [239.5, -0.5], [-0.5, 199.5], [239.5, 199.5], [0, 100]])
     descriptors = compute_descriptors(image, corners, method=method)
@@ -110,7 +107,7 @@ def test_no_point_is_dropped_at_the_border(method, image):
     assert np.isfinite(descriptors).all()
 
 
-@pytest.mark.parametrize("method", [method for method in HERE if method != "imagenet"])  # a network sees the border
+@pytest.mark.parametrize("method", [m for m in BASELINES if m != "imagenet"])  # a network sees the border
 def test_a_plain_image_gives_a_uniform_heatmap(method, image, mask, xy):
     plain = np.full_like(image, 90)
     heatmap, _ = compute_baseline_heatmap(plain, plain, xy[:3], mask, method=method, stride=STRIDE)
@@ -134,18 +131,6 @@ def test_grid_cells_lie_where_documented():
 def test_no_query_gives_an_empty_heatmap(image, mask):
     heatmap, _ = compute_baseline_heatmap(image, image, np.zeros((0, 2)), mask, method="orb", stride=STRIDE)
     assert heatmap.shape == (0, 25, 30)
-
-
-def test_surf_is_used_where_opencv_has_it(image, mask, xy, monkeypatch):
-    monkeypatch.setattr(cv2, "xfeatures2d", SimpleNamespace(SURF_create=cv2.SIFT_create), raising=False)
-    heatmap, grid = compute_baseline_heatmap(image, image, xy, mask, method="surf", stride=STRIDE)
-    assert np.median(np.linalg.norm(find_top(heatmap, grid) - xy, axis=1)) <= 8
-
-
-def test_surf_is_refused_where_opencv_lacks_it(image, mask, xy, monkeypatch):
-    monkeypatch.delattr(cv2, "xfeatures2d", raising=False)
-    with pytest.raises(ValueError, match="non-free modules.*'sift', 'orb', 'akaze', 'daisy'"):
-        compute_baseline_heatmap(image, image, xy, mask, method="surf", stride=STRIDE)
 
 
 @pytest.mark.parametrize(
@@ -173,7 +158,7 @@ def test_bad_arguments_are_named(change, message, image, mask, xy):
         compute_baseline_heatmap(**arguments, method=method, stride=stride)
 
 
-@pytest.mark.parametrize("method", HERE)
+@pytest.mark.parametrize("method", BASELINES)
 def test_a_baseline_answers_as_a_matcher_does(method, image, mask):
     match = BaselineMatcher(method, modes=4).match(image, image, [(100, 90), (130.5, 110)], mask1=mask)
     assert (match.modes.shape, match.covariances.shape, match.heatmap.shape) == ((2, 4, 2), (2, 4, 2, 2), (2, 200, 240))
@@ -191,13 +176,6 @@ def test_a_baseline_takes_images_as_a_matcher_does(image):
 def test_an_unknown_baseline():
     with pytest.raises(ValueError, match="method must be one of 'sift'.*got 'lift'"):
         BaselineMatcher("lift")
-
-
-def test_surf_is_listed_where_opencv_has_it(monkeypatch):
-    monkeypatch.delattr(cv2, "xfeatures2d", raising=False)
-    assert list_baselines() == HERE
-    monkeypatch.setattr(cv2, "xfeatures2d", SimpleNamespace(SURF_create=cv2.SIFT_create), raising=False)
-    assert list_baselines() == BASELINES
 
 
 def encode_colours(image):

@@ -10,7 +10,8 @@ import pandas as pd
 import pytest
 
 from mmgsd.dataset import load_dataset
-from mmgsd.match.matcher import Match, Matcher
+from mmgsd.match.match import Match
+from mmgsd.match.matcher import Matcher
 from mmgsd.measure.figure_data import (
     FigureData,
     choose_example,
