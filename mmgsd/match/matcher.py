@@ -287,7 +287,7 @@ def find_weights(weights: Path | str) -> Path:
     path = Path(weights)
     if path.is_file():  # a folder of a model's name does not hide the model
         return path
-    shipped = {file.stem: file for file in sorted(find_shipped().glob("*.safetensors"))}
+    shipped = {file.stem: file for file in sorted(find_shipped().glob("*.safetensors"), key=lambda file: file.stem)}
     if str(weights) not in shipped and not path.exists():
         raise FileNotFoundError(f"{weights} must be a safetensors file or one of {', '.join(map(repr, shipped))}")
     return shipped.get(str(weights), path)
