@@ -244,9 +244,10 @@ def load(weights: Path | str, *, device: str = "") -> Matcher:
     """
     path = Path(weights)
     if not path.is_file():  # a folder of a model's name does not hide the model
-        shipped = {file.stem: file for file in sorted(find_shipped().glob("*.safetensors"))}
+        shipped = {file.stem: file for file in find_shipped().glob("*.safetensors")}
         if str(weights) not in shipped and not path.exists():
-            raise FileNotFoundError(f"{weights} must be a safetensors file or one of {', '.join(map(repr, shipped))}")
+            names = ", ".join(map(repr, sorted(shipped)))
+            raise FileNotFoundError(f"{weights} must be a safetensors file or one of {names}")
         path = shipped.get(str(weights), path)
     return Matcher.load(path, device=device)
 
