@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import ast
 import os
 import re
 import shutil
 import subprocess
+import sys
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
@@ -128,3 +131,25 @@ def test_the_lock_has_a_fitting_version_of_every_requirement_and_extra() -> None
     pins = dict(re.findall(r"^([\w.-]+)==([^ \\;]+)", (ROOT / "environment.lock").read_text(), re.MULTILINE))
     for requirement in map(Requirement, asked):
         assert requirement.specifier.contains(pins[requirement.name]), requirement
+
+
+def test_every_imported_package_is_a_requirement() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    light = {Requirement(line).name for line in project["dependencies"]}
+    full = light | {Requirement(line).name for extra in ("render", "notebooks") for line in extras[extra]}
+    distributions = packages_distributions()
+    for path in (ROOT / "mmgsd").rglob("*.py"):
+        for package in list_imports(path) - {*sys.stdlib_module_names, "mmgsd", "mathutils"}:  # the last comes with bpy
+            assert full & {name.lower().replace("_", "-") for name in distributions[package]}, (path, package)
+
+
+def list_imports(path: Path) -> set[str]:
+    """The top-level packages that a module imports, at its top or within."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name.partition(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            found.add(node.module.partition(".")[0])
+    return found

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from mmgsd.config import OBJECTS
-from mmgsd.report.tables import PAPER
+from mmgsd.report.results import PAPER
 
 HELD, IN_PART, NOT_HELD, NOT_MEASURED = "held", "held in part", "did not hold", "not measured"
 MARGIN = 0.05  # two errors that differ by less are not told apart: one training each, one seed
