@@ -12,7 +12,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from mmgsd.config import OBJECTS, Preset, RenderConfig, TrainConfig, check_choice
+from mmgsd.checks import check_choice
+from mmgsd.config import OBJECTS, Preset, RenderConfig, TrainConfig
 
 PRESET = "preset"  # what a row starts from that starts from no other: the preset's training
 GREY = "0.5"  # of what has no colour of its own

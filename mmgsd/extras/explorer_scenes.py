@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from mmgsd.config import OBJECTS, PRESETS, Paths, check_choice, find_root, load_preset
+from mmgsd.checks import check_choice
+from mmgsd.config import OBJECTS, PRESETS, Paths, find_root, load_preset
 from mmgsd.dataset import Dataset, load_dataset, sample_pairs
 from mmgsd.experiments import configure_study, get_label
 from mmgsd.images import decode_image, to_rgb

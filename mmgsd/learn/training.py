@@ -19,7 +19,8 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torch.utils import deterministic
 from tqdm.auto import tqdm
 
-from mmgsd.config import CONTRASTIVE, DETAILED, MATCHES_OF_ONE, PASSES, TrainConfig, read_count, read_flag
+from mmgsd.checks import read_count, read_flag
+from mmgsd.config import CONTRASTIVE, DETAILED, MATCHES_OF_ONE, PASSES, TrainConfig
 from mmgsd.dataset import Dataset, hold_out, join_datasets, load_parts
 from mmgsd.files import DamagedFileError, saying_what_stays, set_aside, write_text
 from mmgsd.learn import distributed

@@ -18,7 +18,7 @@ import skimage.feature
 import torch
 from torch import Tensor
 
-from mmgsd.config import check_choice
+from mmgsd.checks import check_choice
 from mmgsd.images import check_pixels, check_question
 from mmgsd.match.match import Match
 from mmgsd.match.matcher import make_match

@@ -27,6 +27,7 @@ from dask.distributed import Client, LocalCluster, as_completed
 from dask.system import cpu_count
 from tqdm.auto import tqdm
 
+from mmgsd.checks import read_count, read_flag
 from mmgsd.config import (
     ADDED,
     DEFAULT_GROUP,
@@ -35,8 +36,6 @@ from mmgsd.config import (
     RenderConfig,
     drop_added,
     find_root,
-    read_count,
-    read_flag,
     to_dict,
 )
 from mmgsd.dataset import load_dataset
