@@ -317,10 +317,10 @@ def _make_network(config: TrainConfig, models: Path) -> torch.nn.Module:
     if start and config.network in PASSES:  # of a model of ours; resnet34 has read torchvision's
         trained = load(start, device="cpu")
         for name in ("network", "descriptor_dim", "roles"):
-            theirs, asked = getattr(trained.config, name), getattr(config, name)
-            within = name == "network" and PASSES.get(theirs, math.inf) <= PASSES[asked] and theirs not in DETAILED
-            if theirs != asked and not within:
-                raise ValueError(f"trunk_weights {start!r} has {name} {theirs!r}, the training {asked!r}")
+            theirs, ours = getattr(trained.config, name), getattr(config, name)
+            within = name == "network" and PASSES.get(theirs, math.inf) <= PASSES[ours] and theirs not in DETAILED
+            if theirs != ours and not within:
+                raise ValueError(f"trunk_weights {start!r} has {name} {theirs!r}, the training {ours!r}")
         network.start_from(trained.network)
     return network
 

@@ -292,9 +292,9 @@ def _is_whole(path: Path, job: dict, claimed: bool) -> bool:
 
 
 def _check_same_config(config: RenderConfig, stored: dict, folder: Path) -> None:
-    asked, stored = _describe(config), drop_added(stored)
-    if stored != asked:
-        there, wanted = ADDED | stored, ADDED | asked
+    wanted, stored = _describe(config), drop_added(stored)
+    if stored != wanted:
+        there, wanted = ADDED | stored, ADDED | wanted
         changed = [f"{k}: {there.get(k)!r} there, {v!r} asked for" for k, v in wanted.items() if there.get(k) != v]
         raise ValueError(f"{folder} holds another data set ({'; '.join(changed)}): use overwrite=True to replace it")
 
