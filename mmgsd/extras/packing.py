@@ -234,18 +234,18 @@ def main() -> None:
     parser.add_argument("action", choices=("pack", "unpack", "sample"))
     parser.add_argument("preset", nargs="?", default="paper")
     parser.add_argument("--quality", type=int, default=QUALITY, help="of WebP, 1 to 100 (default %(default)s)")
-    args = parser.parse_args()
-    load_preset(args.preset)
-    paths = Paths(find_root(), args.preset)
+    asked = parser.parse_args()
+    load_preset(asked.preset)
+    paths = Paths(find_root(), asked.preset)
     for name in OBJECTS:
-        folder, archive = paths.dataset(name), paths.root / "data" / "packs" / f"{args.preset}-{name}.zip"
-        if args.action == "pack":
-            note = pack_dataset(folder, archive, quality=args.quality)
+        folder, archive = paths.dataset(name), paths.root / "data" / "packs" / f"{asked.preset}-{name}.zip"
+        if asked.action == "pack":
+            note = pack_dataset(folder, archive, quality=asked.quality)
             print(f"{archive}: {note['bytes'] / 1e6:.1f} MB, SHA-256 {note['sha256']}, seed {note['seed']}")
-        elif args.action == "unpack":
+        elif asked.action == "unpack":
             print(f"{unpack_dataset(archive, folder)}: complete and checked")
         else:
-            print(f"{write_sample(folder, paths.root / 'data' / 'sample' / name, quality=args.quality)}: checked")
+            print(f"{write_sample(folder, paths.root / 'data' / 'sample' / name, quality=asked.quality)}: checked")
 
 
 if __name__ == "__main__":
