@@ -67,11 +67,6 @@ def make_scenes(data: Dataset, *, pairs: int = 50, seed: int = 0) -> list[Callab
     return [lambda a=int(a), b=int(b): make(a, b) for a, b in chosen]
 
 
-def make_own_scene(image0: np.ndarray, image1: np.ndarray) -> Scene:
-    """A scene of a user's own images, of any kind that `Matcher.match` takes."""
-    return Scene(to_rgb(image0, "image0"), to_rgb(image1, "image1"))
-
-
 def choose_scenes(name: str, preset: str = SAMPLE, own_images: Sequence[Path | str] = ()) -> list:
     """The pairs to open for an object: two image files where ``own_images`` names them, else test images of a data set.
 
