@@ -7,15 +7,14 @@ an argument of the stage, never part of its configuration.
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import hashlib
 import json
-import math
-import numbers
 import os
 import re
 from pathlib import Path
 from typing import Any, TypeVar
+
+from mmgsd.checks import check, check_choice, check_types
 
 OBJECTS = ("cloth", "rope")
 SCENES = ("plain", "workspace")  # a patterned floor alone, or a robotics lab's table and what lies about on it
@@ -42,11 +41,6 @@ N_POINTS = 625  # material points of the cloth and the rope
 Config = TypeVar("Config", bound="RenderConfig | TrainConfig | EvaluateConfig")
 
 
-def _check(name: str, value: Any, accepted: str, ok: bool) -> None:
-    if not ok:
-        raise ValueError(f"{name} must be {accepted}, got {value!r}")
-
-
 def _check_object(name: str) -> None:
     """The cloth, the rope, or a name that an object of the user's own may have, whether its file is there yet or not.
 
@@ -54,52 +48,13 @@ def _check_object(name: str) -> None:
     """
     accepted = (f"{', '.join(map(repr, OBJECTS))} or the name of a file in data/objects: up to 60 letters, digits, "
                 "- and _, a letter first")  # fmt: skip
-    _check("object", name, accepted, name in OBJECTS or re.fullmatch("[A-Za-z][A-Za-z0-9_-]{0,59}", name) is not None)
+    check("object", name, accepted, name in OBJECTS or re.fullmatch("[A-Za-z][A-Za-z0-9_-]{0,59}", name) is not None)
     taken = name not in OBJECTS and name.lower() in (*OBJECTS, *RESERVED)  # not every disk tells Cloth from cloth
-    _check("object", name, f"another name than {', '.join(map(repr, (*OBJECTS, *RESERVED)))}, which are taken: "
+    check("object", name, f"another name than {', '.join(map(repr, (*OBJECTS, *RESERVED)))}, which are taken: "
            f"{name + '2'!r}, for example", not taken)  # fmt: skip
 
 
-def check_choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
-    """ValueError that names the argument and the choices, the nearest one too, where ``value`` is none of them."""
-    close = difflib.get_close_matches(str(value), choices, n=1)
-    hint = f" (did you mean {close[0]!r}?)" if close else ""
-    _check(name, value, f"one of {', '.join(map(repr, choices))}{hint}", value in choices)
-
-
-FLAGS = {"true": True, "yes": True, "on": True, "1": True, "false": False, "no": False, "off": False, "0": False}
-
-
-def read_flag(name: str, value: Any) -> bool:
-    """A flag from a boolean, 0 or 1, or its usual spellings ("true", "No", "off"); ValueError names it otherwise.
-
-    papermill hands ``-p overwrite false`` over as a string, which Python takes for true.
-    """
-    word = str(value).strip().lower()
-    _check(name, value, "true or false (yes, no, on, off, 1, 0)", word in FLAGS)
-    return FLAGS[word]
-
-
-def read_count(name: str, value: Any, *, least: int = 0) -> int:
-    """An integer of at least ``least``; ValueError names it otherwise, also where it is a string or a boolean."""
-    _check(name, value, "an integer", isinstance(value, numbers.Integral) and not isinstance(value, bool))
-    _check(name, value, f"at least {least}", value >= least)
-    return int(value)
-
-
 _set_frozen = object.__setattr__  # a field named ``object`` hides the builtin inside a class body
-
-
-def _check_types(config: Any) -> None:
-    """Reject values whose type is not the field's: a string steps='200' would fail much later."""
-    kinds = {"int": int, "float": (int, float), "str": str, "bool": bool}
-    for field in dataclasses.fields(config):
-        value, kind = getattr(config, field.name), str(field.type)
-        wrong_bool = isinstance(value, bool) and kind != "bool"
-        if wrong_bool or not isinstance(value, kinds[kind]) or (kind == "float" and not math.isfinite(value)):
-            raise ValueError(f"{field.name} must be {'a finite float' if kind == 'float' else kind}, got {value!r}")
-        if kind == "float":  # 1 and 1.0 are one configuration, with one digest
-            _set_frozen(config, field.name, float(value))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -121,14 +76,14 @@ class RenderConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        _check_types(self)
+        check_types(self)
         _check_object(self.object)
         for name in ("train_images", "test_images", "views", "samples"):
-            _check(name, getattr(self, name), "at least 1", getattr(self, name) >= 1)
-        _check("rotation_deg", self.rotation_deg, "in (0, 180]", 0 < self.rotation_deg <= 180)
-        _check("ball", self.ball, "False for a cloth", not self.ball or self.object == "rope")
+            check(name, getattr(self, name), "at least 1", getattr(self, name) >= 1)
+        check("rotation_deg", self.rotation_deg, "in (0, 180]", 0 < self.rotation_deg <= 180)
+        check("ball", self.ball, "False for a cloth", not self.ball or self.object == "rope")
         check_choice("scene", self.scene, SCENES)
-        _check("seed", self.seed, "at least 0", self.seed >= 0)
+        check("seed", self.seed, "at least 0", self.seed >= 0)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -174,7 +129,7 @@ class TrainConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        _check_types(self)
+        check_types(self)
         _check_object(self.object)
         check_choice("method", self.method, METHODS)
         check_choice("network", self.network, NETWORKS)
@@ -182,23 +137,23 @@ class TrainConfig:
         check_choice("schedule", self.schedule, ("cosine", "step"))
         _set_frozen(self, "group", self.group or DEFAULT_GROUP.get(self.object, OWN_GROUP))
         weight = self.prototype_weight
-        _check("prototype_weight", weight, "at least 0, or -1 for the method's own", weight >= 0 or weight == -1)
+        check("prototype_weight", weight, "at least 0, or -1 for the method's own", weight >= 0 or weight == -1)
         for name in ("descriptor_dim", "steps", "pairs", "queries"):
-            _check(name, getattr(self, name), "at least 1", getattr(self, name) >= 1)
-        _check("roles", self.roles, "1 or 2", self.roles in (1, 2))
-        _check("non_matches", self.non_matches, "at least 2 (on and off the object)", self.non_matches >= 2)
+            check(name, getattr(self, name), "at least 1", getattr(self, name) >= 1)
+        check("roles", self.roles, "1 or 2", self.roles in (1, 2))
+        check("non_matches", self.non_matches, "at least 2 (on and off the object)", self.non_matches >= 2)
         for name in ("learning_rate", "sigma_px", "sigma_start_px", "margin", "roundness"):
-            _check(name, getattr(self, name), "greater than 0", getattr(self, name) > 0)
-        _check("batch", self.batch, "at least 2 (a pair)", self.batch >= 2)
+            check(name, getattr(self, name), "greater than 0", getattr(self, name) > 0)
+        check("batch", self.batch, "at least 2 (a pair)", self.batch >= 2)
         each = f"a divisor of batch and pairs that leaves at least 2 of {self.batch} images and a pair in each"
         divides = self.groups >= 1 and self.batch % self.groups == 0 == self.pairs % self.groups
-        _check("groups", self.groups, each, divides and self.batch // self.groups >= 2)
+        check("groups", self.groups, each, divides and self.batch // self.groups >= 2)
         least = 128 if self.network in DETAILED else 64  # px, of which the trunk sees 64
-        _check("input_px", self.input_px, f"at least {least} for {self.network!r}", self.input_px >= least)
-        _check("bend", self.bend, "in [0, 0.5]", 0 <= self.bend <= 0.5)
+        check("input_px", self.input_px, f"at least {least} for {self.network!r}", self.input_px >= least)
+        check("bend", self.bend, "in [0, 0.5]", 0 <= self.bend <= 0.5)
         for name in ("weight_decay", "seed"):
-            _check(name, getattr(self, name), "at least 0", getattr(self, name) >= 0)
-        _check("heads", self.heads, f"False for {self.network!r}", not self.heads or self.network in PASSES)
+            check(name, getattr(self, name), "at least 0", getattr(self, name) >= 0)
+        check("heads", self.heads, f"False for {self.network!r}", not self.heads or self.network in PASSES)
         if self.also:
             check_choice("also", self.also, tuple(PRESETS))
 
@@ -223,10 +178,10 @@ class EvaluateConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        _check_types(self)
-        _check("pairs", self.pairs, "at least 1", self.pairs >= 1)
-        _check("points", self.points, f"between 1 and {N_POINTS}", 1 <= self.points <= N_POINTS)
-        _check("seed", self.seed, "at least 0", self.seed >= 0)
+        check_types(self)
+        check("pairs", self.pairs, "at least 1", self.pairs >= 1)
+        check("points", self.points, f"between 1 and {N_POINTS}", 1 <= self.points <= N_POINTS)
+        check("seed", self.seed, "at least 0", self.seed >= 0)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -262,6 +217,12 @@ def load_preset(name: str) -> Preset:
     return PRESETS[name]
 
 
+PAPER = dict(
+    train_images=3500, test_images=500, views={"cloth": 5, "rope": 10},
+    train={"steps": 4000, "bend": 0.5, "roles": 2}, rope={"input_px": 160},
+    ablation={"steps": 1000}, sigmas=(1.0, 2.0, 4.0, 8.0, 16.0),
+    evaluate={"pairs": 500, "points": 625},
+)  # fmt: skip
 PRESETS = {
     "smoke": _preset(
         "smoke",
@@ -277,20 +238,8 @@ PRESETS = {
         ablation={"steps": 60}, sigmas=(1.0, 4.0, 16.0),
         evaluate={"pairs": 30, "points": 625},
     ),
-    "paper": _preset(
-        "paper",
-        train_images=3500, test_images=500, views={"cloth": 5, "rope": 10},
-        train={"steps": 4000, "bend": 0.5, "roles": 2}, rope={"input_px": 160},
-        ablation={"steps": 1000}, sigmas=(1.0, 2.0, 4.0, 8.0, 16.0),
-        evaluate={"pairs": 500, "points": 625},
-    ),
-    "workspace": _preset(
-        "workspace",
-        train_images=3500, test_images=500, views={"cloth": 5, "rope": 10}, scene="workspace",
-        train={"steps": 4000, "bend": 0.5, "roles": 2}, rope={"input_px": 160},
-        ablation={"steps": 1000}, sigmas=(1.0, 2.0, 4.0, 8.0, 16.0),
-        evaluate={"pairs": 500, "points": 625},
-    ),
+    "paper": _preset("paper", **PAPER),
+    "workspace": _preset("workspace", **PAPER, scene="workspace"),
 }  # fmt: skip
 
 

@@ -12,7 +12,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from mmgsd.config import OBJECTS, Preset, RenderConfig, TrainConfig, check_choice
+from mmgsd.checks import check_choice
+from mmgsd.config import OBJECTS, Preset, RenderConfig, TrainConfig
 
 PRESET = "preset"  # what a row starts from that starts from no other: the preset's training
 GREY = "0.5"  # of what has no colour of its own
@@ -181,7 +182,7 @@ def _configure(base: TrainConfig, row: Model) -> TrainConfig:
 def list_runs(preset: Preset, studies: Sequence[str] = RUN) -> list[TrainConfig]:
     """The models of some studies, the most important first, each once; of the main table, the longer ones last.
 
-    Models that need images of another preset besides are left out where all studies are run.
+    Those of the main table that need images of another preset besides are run in their own study alone.
     """
     found = []
     for study in studies:
@@ -189,8 +190,9 @@ def list_runs(preset: Preset, studies: Sequence[str] = RUN) -> list[TrainConfig]
         names = dict.fromkeys(name for keyed in models.values() for name in keyed)
         late = [n for n in names if study == "main" and "budget" not in ROWS[n].studies]
         ordered = [*(n for n in names if n not in late), *late]
-        found += [models[o][n] for n in ordered for o in OBJECTS if n in models[o]]
-    return [model for model in dict.fromkeys(found) if tuple(studies) != RUN or not model.also]
+        runs = [models[o][n] for n in ordered for o in OBJECTS if n in models[o]]
+        found += [model for model in runs if study != "main" or not model.also]
+    return list(dict.fromkeys(found))
 
 
 def get_label(name: str, *, short: bool = False) -> str:

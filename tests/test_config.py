@@ -19,7 +19,6 @@ from mmgsd.config import (
     find_root,
     from_dict,
     load_preset,
-    read_flag,
     to_dict,
 )
 
@@ -197,17 +196,3 @@ def test_find_root_without_a_repository(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(config_module, "__file__", str(tmp_path / "site" / "config.py"))
     with pytest.raises(FileNotFoundError, match="environment.lock.*MMGSD_ROOT"):
         find_root(tmp_path)
-
-
-@pytest.mark.parametrize(("value", "flag"), [
-    (True, True), (False, False), ("false", False), ("False", False), (" NO ", False), ("off", False), (0, False),
-    ("true", True), ("yes", True), ("1", True), (1, True),
-])  # fmt: skip
-def test_flags_take_their_usual_spellings(value, flag):
-    assert read_flag("overwrite", value) is flag
-
-
-@pytest.mark.parametrize("value", ["maybe", "", 2, None, [], "truefalse"])
-def test_what_is_no_flag_is_refused_by_name(value):
-    with pytest.raises(ValueError, match="overwrite must be true or false"):
-        read_flag("overwrite", value)

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from mmgsd.config import OBJECTS, PRESETS, Paths, check_choice, find_root, find_shipped, load_preset
+from mmgsd.checks import check_choice
+from mmgsd.config import OBJECTS, PRESETS, Paths, find_root, find_shipped, load_preset
 from mmgsd.dataset import Dataset, load_dataset, sample_pairs
 from mmgsd.experiments import configure_study, get_label
 from mmgsd.images import decode_image, to_rgb
@@ -64,11 +65,6 @@ def make_scenes(data: Dataset, *, pairs: int = 50, seed: int = 0) -> list[Callab
 
     chosen = sample_pairs(data.episode, pairs, np.random.default_rng(seed), present=data.present)
     return [lambda a=int(a), b=int(b): make(a, b) for a, b in chosen]
-
-
-def make_own_scene(image0: np.ndarray, image1: np.ndarray) -> Scene:
-    """A scene of a user's own images, of any kind that `Matcher.match` takes."""
-    return Scene(to_rgb(image0, "image0"), to_rgb(image1, "image1"))
 
 
 def choose_scenes(name: str, preset: str = SAMPLE, own_images: Sequence[Path | str] = ()) -> list:

@@ -28,8 +28,9 @@ import pyarrow.parquet as pq
 from PIL import Image
 from tqdm.auto import tqdm
 
+from mmgsd.checks import read_flag
 from mmgsd.command import run_command
-from mmgsd.config import OBJECTS, Paths, find_root, load_preset, read_flag
+from mmgsd.config import OBJECTS, Paths, find_root, load_preset
 from mmgsd.dataset import Dataset, check_dataset, encode_mask, load_dataset
 from mmgsd.dataset_format import SPLITS, TABLES, find_owner, is_member
 from mmgsd.extras.croissant import write_croissant

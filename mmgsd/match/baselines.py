@@ -21,7 +21,7 @@ import skimage.feature
 import torch
 from torch import Tensor
 
-from mmgsd.config import check_choice
+from mmgsd.checks import check_choice
 from mmgsd.images import check_pixels, check_question
 from mmgsd.match.features import Extractor, extract_imagenet, sample_features
 from mmgsd.match.match import Match

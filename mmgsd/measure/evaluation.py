@@ -14,7 +14,8 @@ from scipy.optimize import minimize_scalar
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from mmgsd.config import EvaluateConfig, digest, read_count, read_flag
+from mmgsd.checks import read_count, read_flag
+from mmgsd.config import EvaluateConfig, digest
 from mmgsd.dataset import Dataset, load_dataset, sample_pairs
 from mmgsd.dataset_format import UNREADABLE
 from mmgsd.files import DamagedFileError, read_json, saying_what_stays, set_aside, write_json, writing

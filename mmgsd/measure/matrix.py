@@ -18,8 +18,9 @@ from pathlib import Path
 from dask.distributed import Client, as_completed
 from tqdm.auto import tqdm
 
+from mmgsd.checks import read_count
 from mmgsd.command import run_command
-from mmgsd.config import OBJECTS, Paths, Preset, TrainConfig, find_root, load_preset, read_count
+from mmgsd.config import OBJECTS, Paths, Preset, TrainConfig, find_root, load_preset
 from mmgsd.experiments import (
     RUN,
     STUDIES,

@@ -181,3 +181,26 @@ def test_what_a_model_starts_from_is_trained_before_it(tiny_dataset: Callable[..
     with LocalCluster(**how, silence_logs="ERROR") as cluster:
         there = dict(run_tasks([longer, finer, deeper], preset, tmp_path, scheduler=cluster.scheduler_address))
     assert there[deeper.name] == rmse
+
+
+@pytest.mark.parametrize(("words", "names"), [
+    ("--study robustness --only cloth", ["mmgsd", "mmgsd_workspace", "mmgsd_clutter", "mmgsd_heads"]),
+    ("--study shipped --only cloth", ["shipped"]),
+])  # fmt: skip
+def test_a_study_can_be_run_alone(words: str, names: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    chosen, paper = [], load_preset("paper")
+    monkeypatch.setattr(matrix, "run_tasks", lambda tasks, *_, **__: chosen.extend(tasks) or iter(()))
+    monkeypatch.setattr("sys.argv", ["matrix", "paper", *words.split()])
+    matrix.main()
+    assert chosen == list(configure_study(paper, "cloth", words.split()[1]).values())
+    assert list(configure_study(paper, "cloth", words.split()[1])) == names
+
+
+@pytest.mark.parametrize("words", ["--study fixes", "--study robustness --seeds 2"])
+def test_a_study_that_is_another_list_is_refused(
+    words: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.setattr("sys.argv", ["matrix", "paper", *words.split()])
+    with pytest.raises(SystemExit):
+        matrix.main()
+    assert "--study" in capsys.readouterr().err
