@@ -56,14 +56,14 @@ unit: $(STAMP) ## Run the tests in tests/
 # run_all would run every notebook a second time: a test in tests/ runs it through papermill.
 notebooks-test: $(STAMP) ## Run the notebooks and compare their outputs with the committed ones
 	$(PY) -m pytest --nbval --nbval-current-env --nbval-cell-timeout=600 \
-		--nbval-sanitize-with=tests/nbval_sanitize.cfg notebooks/0*.ipynb notebooks/explore.ipynb notebooks/your_*.ipynb
+		--nbval-sanitize-with=tests/nbval_sanitize.cfg notebooks/[01]*.ipynb notebooks/explore.ipynb notebooks/your_*.ipynb
 
 figures: $(STAMP) ## Draw the paper's figures of PRESET (paper) again from data/results, without training
 	@mkdir -p data/generated
 	$(PAPERMILL) notebooks/07_figures.ipynb data/generated/figures_$(PRESET).ipynb -p preset $(PRESET)
 
-readme: $(STAMP) ## Put the numbers of data/results into the tables of README.md and data/results/README.md
-	$(PY) -m mmgsd.report.tables data/results README.md data/results/README.md
+readme: $(STAMP) ## Put the numbers of data/results into README.md, the results page and docs/claims.md
+	$(PY) -m mmgsd.report.tables data/results README.md data/results/README.md docs/claims.md
 
 data-pack: $(STAMP) ## Pack the data sets of PRESET (paper) into data/packs, to travel to another machine
 	$(PY) -m mmgsd.extras.packing pack $(PRESET)
@@ -141,7 +141,7 @@ lock: ## Make environment.lock from pyproject.toml (UV=uv, FIND_LINKS=folder wit
 
 # --- cleaning ----------------------------------------------------------------------------------------------------
 clean: ## Remove caches and what the preset smoke made
-	rm -rf .pytest_cache .ruff_cache .hypothesis data/generated/smoke data/results/smoke figures/smoke
+	rm -rf .pytest_cache .ruff_cache .hypothesis build dist mmgsd.egg-info data/generated/smoke data/results/smoke figures/smoke
 	rm -f data/generated/run_all_smoke.ipynb figures/data/smoke_*
 	find . -path ./.venv -prune -o \( -name __pycache__ -o -name .ipynb_checkpoints \) -type d -exec rm -rf {} +
 

@@ -1,165 +1,113 @@
-"""The command line: ``python -m mmgsd match``, ``export``, ``calibrate``, ``heads``."""
+"""The command line, ``python -m mmgsd COMMAND``: its words. What the commands do is in `mmgsd.cli`."""
 
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import sys
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 import mmgsd
+from mmgsd import cli
+from mmgsd.command import describe_error
 from mmgsd.config import MAX_MODES
 
 EXAMPLE = "example: python -m mmgsd match towel1.jpg towel2.jpg --xy 212,148 --weights FILE --out match.png"
-DPI = 150  # of a picture
+PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Run a command.
 
     Exits with 2 and one sentence for a wrong argument or a file that does not do, with 1 where the result cannot be
-    written, and with 130 after Ctrl-C.
+    written or one of many images could not be answered, and with 130 after Ctrl-C.
     """
     parser = make_parser()
     asked = parser.parse_args(arguments)
     try:
-        commands = {"match": _match, "export": _export, "calibrate": _calibrate, "heads": _heads}
-        commands[asked.command](asked)
+        asked.run(asked)
     except KeyboardInterrupt:
-        out = getattr(asked, "out", None)
-        kept = f"{out} is as it was before" if out else "there was nothing to keep"
-        parser.exit(130, f"stopped: {kept}\n")
+        parser.exit(130, f"stopped: {_say_kept(asked)}\n")
     except BrokenPipeError:  # who reads the output has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (ValueError, FileNotFoundError, IsADirectoryError, PermissionError) as error:
-        parser.exit(2, f"error: {_say(error)}\n")
+        parser.exit(2, f"error: {cli.say_error(error)}\n")
+    except ModuleNotFoundError as error:
+        parser.exit(2, f"error: {describe_error(error)}\n")
     except (OSError, RuntimeError, MemoryError) as error:
-        parser.exit(1, f"error: {_say(error)}\n")
+        parser.exit(1, f"error: {cli.say_error(error)}\n")
 
 
-def _say(error: BaseException) -> str:
-    """An error in one line."""
-    return " ".join(str(error).split()) or type(error).__name__
+def _say_kept(asked: argparse.Namespace) -> str:
+    written = [str(path) for path in (getattr(asked, name, None) for name in ("out", "csv")) if path]
+    if not written:
+        return "there was nothing to keep"
+    return f"{' and '.join(written)} {'is as it was' if len(written) == 1 else 'are as they were'} before"
 
 
 def make_parser() -> argparse.ArgumentParser:
     """The commands and their options."""
     parser = argparse.ArgumentParser(prog="python -m mmgsd", description=mmgsd.__doc__)
     commands = parser.add_subparsers(dest="command", required=True, metavar="command")
-    match = commands.add_parser("match", help="find all matches of pixels between two image files", epilog=EXAMPLE)
-    match.add_argument("image0", type=Path, help="the image that the pixels are in")
-    match.add_argument("image1", type=Path, help="the image to find them in")
-    match.add_argument("--xy", type=_parse_pixel, action="append", required=True, metavar="X,Y",
-                       help="column,row px in image0, the top left one is 0,0; may be given several times")  # fmt: skip
-    match.add_argument("--n", type=_parse_number, metavar="N", help="modes, or auto; default: as many as its symmetry")
-    match.add_argument("--out", type=_parse_picture, metavar="FILE", help="draw the answer (png, jpg, pdf or svg)")
-    match.add_argument("--json", action="store_true", help="print the answer as JSON")
-    export = commands.add_parser("export", help="write a network as ONNX: image in, descriptors out")
-    export.add_argument("out", type=Path, help="the file to write, .onnx")
-    for command in (match, export):
-        command.add_argument("--weights", required=True, metavar="FILE",
+    _add_match(commands.add_parser("match", help="find all matches of pixels of an image in others", epilog=EXAMPLE))
+    _add_segment(commands.add_parser("segment", help="write where an image shows the object"))
+    _add_measure(commands.add_parser("measure", help="measure on photographs with marked corners or ends"))
+    _add_export(commands.add_parser("export", help="write a network as ONNX: image in, descriptors out"))
+    for name, command in commands.choices.items():
+        default = {"default": "cloth"} if name == "measure" else {"required": True}
+        command.add_argument("--weights", metavar="FILE", **default,
                              help="a trained model (safetensors), or a name in data/weights, like cloth")  # fmt: skip
     _add_measures(commands)
     return parser
 
 
-def _add_measures(commands: Any) -> None:
+def _add_measures(commands: argparse._SubParsersAction) -> None:
     """The commands that need a data set."""
     calibrate = commands.add_parser("calibrate", help="fit what ellipses, radii and confidences promise, and keep it")
     calibrate.add_argument("--overwrite", action="store_true", help="fit it anew where the weights have it")
+    calibrate.set_defaults(run=cli.calibrate)
     heads = commands.add_parser("heads", help="measure the masks, hidden matches and absence that weights tell")
     heads.add_argument("--out", type=Path, required=True, metavar="FILE", help="the results to write (JSON)")
+    heads.set_defaults(run=cli.heads)
     for command in (calibrate, heads):
         command.add_argument("weights", type=Path, help="a trained model (safetensors)")
         command.add_argument("--data", type=Path, required=True, metavar="FOLDER", help="the data set trained on")
 
 
-def _calibrate(asked: argparse.Namespace) -> None:
-    from mmgsd.measure.calibration import calibrate_weights
-
-    found = mmgsd.load(calibrate_weights(asked.weights, asked.data, overwrite=asked.overwrite)).calibration
-    print(f"{asked.weights}: calibrated on {found.pairs} pairs of held-out simulations; each half by the other: "
-          f"ECE {found.ece_ellipse:.3f} of ellipses, {found.ece_confidence:.3f} of confidences")  # fmt: skip
-
-
-def _heads(asked: argparse.Namespace) -> None:
-    from mmgsd.config import EvaluateConfig
-    from mmgsd.files import read_json
-    from mmgsd.measure.heads import evaluate_heads
-
-    print(json.dumps(read_json(evaluate_heads(asked.weights, asked.data, EvaluateConfig(pairs=100), asked.out))))
-
-
-def _match(asked: argparse.Namespace) -> None:
-    _check_out(asked)
-    images = [mmgsd.read_image(path) for path in (asked.image0, asked.image1)]
-    answer = mmgsd.load(asked.weights).match(*images, asked.xy, n=asked.n)
-    described = describe_answer(answer)
-    if asked.out:
-        _draw(answer, asked.out)
-    print(json.dumps(described) if asked.json else "\n".join(map(_format_query, described)), flush=True)
+def _add_match(match: argparse.ArgumentParser) -> None:
+    match.add_argument("image0", type=Path, help="the image that the pixels are in")
+    match.add_argument("image1", type=Path, help="the image to find them in, or a folder of such images")
+    match.add_argument("--xy", type=_parse_pixel, action="append", required=True, metavar="X,Y",
+                       help="column,row px in image0, the top left one is 0,0; may be given several times")  # fmt: skip
+    match.add_argument("--n", type=_parse_number, metavar="N", help="modes, or auto; default: as many as its symmetry")
+    for name in ("mask0", "mask1"):
+        match.add_argument(f"--{name}", type=Path, metavar="FILE",
+                           help=f"an image as large as image{name[-1]}, brighter than half on the object")  # fmt: skip
+    match.add_argument("--out", type=_parse_picture, metavar="FILE", help="draw the answer (png, jpg, pdf or svg)")
+    match.add_argument("--pictures", type=Path, metavar="FOLDER", help="draw the answer of each image of a folder")
+    match.add_argument("--csv", type=Path, metavar="FILE", help="write a table, a row a mode")
+    match.add_argument("--json", action="store_true", help="print the answer as JSON, of a folder a line an image")
+    match.set_defaults(run=cli.match)
 
 
-def _check_out(asked: argparse.Namespace) -> None:
-    """ValueError for a picture that would replace an image, or hold more queries than a page does."""
-    if not asked.out:
-        return
-    from mmgsd.figures.plots import PAGE_QUERIES
-
-    if asked.out.resolve() in (asked.image0.resolve(), asked.image1.resolve()):
-        raise ValueError(f"--out must not be one of the images, got {asked.out}")
-    if len(asked.xy) > PAGE_QUERIES:
-        raise ValueError(f"--xy must be given at most {PAGE_QUERIES} times with --out, got {len(asked.xy)}")
+def _add_segment(segment: argparse.ArgumentParser) -> None:
+    segment.add_argument("image", type=Path, help="the image to look at")
+    segment.add_argument("out", type=Path, help="the mask to write, .png: brighter than half on the object")
+    segment.set_defaults(run=cli.segment)
 
 
-def _export(asked: argparse.Namespace) -> None:
-    from mmgsd.extras.exporting import export_onnx
-
-    difference = export_onnx(mmgsd.load(asked.weights), asked.out)
-    print(f"{asked.out}: images of any size in, descriptors as of Matcher.describe out, the mean over quarter turns "
-          f"included; they differ from torch's by {difference:.1e} at most")  # fmt: skip
-
-
-def describe_answer(answer: Any) -> list[dict[str, Any]]:
-    """A `Match` as plain values, a dictionary a query: px, shares, nats."""
-    confidence, described = answer.confidence(), []
-    for query, xy in enumerate(answer.xy):
-        present = np.flatnonzero(answer.weights[query] > 0)
-        modes = [
-            {
-                "xy": answer.modes[query, k].round(2).tolist(),
-                "weight": round(float(answer.weights[query, k]), 4),
-                "spread_px": round(float(answer.spread_px[query, k]), 2),
-                "confidence": round(float(confidence[query, k]), 4),
-            }
-            for k in present
-        ]
-        scalars = {name: round(float(getattr(answer, name)[query]), 4) for name in ("entropy", "outside")}
-        described.append({"xy": xy.round(2).tolist(), "modes": modes, **scalars})
-    return described
+def _add_measure(measure: argparse.ArgumentParser) -> None:
+    measure.add_argument("place", type=Path, metavar="FOLDER",
+                         help="with index.json, or such a file; its format: mmgsd/measure/photographs.py")  # fmt: skip
+    measure.add_argument("--out", type=_parse_picture, metavar="FILE", help="draw an answer about each photograph")
+    measure.add_argument("--store", metavar="NAME", help="write the numbers to data/results/photographs_NAME.json")
+    measure.add_argument("--json", action="store_true", help="print the numbers as JSON")
+    measure.set_defaults(run=cli.measure)
 
 
-def _format_query(query: dict[str, Any]) -> str:
-    x, y = query["xy"]
-    modes = ", ".join("{:.1f},{:.1f} (±{:.0f} px)".format(*m["xy"], m["spread_px"]) for m in query["modes"])
-    return f"{x:g},{y:g} -> {modes}"
-
-
-def _draw(answer: Any, path: Path) -> None:
-    """One query as two large panels, several as a page."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from mmgsd.figures.plots import plot_page
-    from mmgsd.files import writing
-
-    figure = answer.plot() if len(answer) == 1 else plot_page(answer)
-    with writing(path) as aside:
-        figure.savefig(aside, format=path.suffix[1:].lower(), dpi=DPI)
+def _add_export(export: argparse.ArgumentParser) -> None:
+    export.add_argument("out", type=Path, help="the file to write, .onnx")
+    export.set_defaults(run=cli.export)
 
 
 def _parse_pixel(text: str) -> tuple[float, float]:
@@ -173,7 +121,7 @@ def _parse_pixel(text: str) -> tuple[float, float]:
 
 
 def _parse_picture(text: str) -> Path:
-    if Path(text).suffix.lower() not in (".png", ".jpg", ".jpeg", ".pdf", ".svg"):
+    if Path(text).suffix.lower() not in PICTURES:
         raise argparse.ArgumentTypeError(f"must end with .png, .jpg, .pdf or .svg, got {text!r}")
     return Path(text)
 

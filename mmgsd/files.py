@@ -160,22 +160,24 @@ def locked(folder: Path, doing: str) -> Iterator[None]:
     path = folder.with_name(f".{folder.name}.lock")
     with _take(path) as file:
         if file is None:
-            holder = path.read_text().strip() if path.is_file() else ""
+            holder = path.read_text("utf-8").strip() if path.is_file() else ""
             raise LockedError(f"{folder} is in use by {holder or 'another process'}: wait for it, or stop it")
         file.truncate(0)
-        file.write(f"process {os.getpid()} on {socket.gethostname()}, {doing} since {time.strftime('%F %T')}\n")
+        since = time.strftime("%Y-%m-%d %H:%M:%S")
+        file.write(f"process {os.getpid()} on {socket.gethostname()}, {doing} since {since}\n")
         file.flush()
         try:
             yield
         finally:
-            path.unlink(missing_ok=True)
+            if fcntl:  # Windows removes no open file
+                path.unlink(missing_ok=True)
 
 
 @contextmanager
 def _take(path: Path) -> Iterator[TextIO | None]:
     """The lock file, held, or None where another process holds it; one that was removed meanwhile is opened anew."""
     while True:
-        with open(path, "a+") as file:
+        with open(path, "a+", encoding="utf-8") as file:
             try:
                 if fcntl:
                     fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -209,8 +211,8 @@ def saying_what_stays(describe: Callable[[], str]) -> Iterator[None]:
 
 
 def _is_running(host: str, pid: int) -> bool:
-    """Whether the process may be alive: of another machine that is not known."""
-    if host != re.sub("[^A-Za-z0-9_]", "_", socket.gethostname()):
+    """Whether the process may be alive: of another machine, and on Windows, that is not known."""
+    if os.name != "posix" or host != re.sub("[^A-Za-z0-9_]", "_", socket.gethostname()):
         return True
     try:
         os.kill(pid, 0)
@@ -232,7 +234,7 @@ def _flush(path: Path) -> None:
     """Have the system write a file, or a folder's entries, to the disk."""
     if path.is_dir() and os.name != "posix":
         return
-    handle = os.open(path, os.O_RDONLY)
+    handle = os.open(path, os.O_RDONLY if os.name == "posix" else os.O_RDWR)  # Windows flushes what may be written
     try:
         os.fsync(handle)
     finally:

@@ -12,6 +12,8 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 
 CHANNELS = (1, 3, 4)  # grey, RGB, RGBA
 MAX_ASPECT = 16  # longer side by shorter side, beyond which too few of the network's cells lie across
+ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".gif", ".heic", ".heif")
+WHITE = 255
 DEEP = 257  # steps of 16 bits to a step of 8: 65535 becomes 255
 
 
@@ -32,6 +34,32 @@ def read_image(path: Path | str) -> np.ndarray:
     return _decode(path, str(path))
 
 
+def read_mask(path: Path | str, shape: tuple[int, int]) -> np.ndarray:
+    """(H, W) bool of a mask's file, True where it is brighter than half, for an image of that ``shape``.
+
+    ValueError, which names the file, for one of another size or without any object, and as `read_image`.
+    """
+    mask = read_image(path).mean(-1) > WHITE / 2
+    if mask.shape != tuple(shape):
+        (height, width), (rows, columns) = shape, mask.shape
+        raise ValueError(f"{path} must be a mask of its image's {width} x {height} px, got {columns} x {rows} px")
+    if not mask.any():
+        raise ValueError(f"{path} must be a mask that is brighter than half on the object, got one darker everywhere")
+    return mask
+
+
+def list_images(folder: Path | str) -> list[Path]:
+    """The image files of a folder, by their names' endings, in the order of their names; ValueError where it has none.
+
+    Hidden files and folders in it are left out.
+    """
+    paths = sorted(path for path in Path(folder).iterdir() if path.suffix.lower() in ENDINGS)
+    found = [path for path in paths if path.is_file() and not path.name.startswith(".")]
+    if not found:
+        raise ValueError(f"{folder} holds no image: its files must end with one of {', '.join(ENDINGS)}")
+    return found
+
+
 def decode_image(data: bytes, name: str) -> np.ndarray:
     """As `read_image`, from the bytes of a file that was called ``name``."""
     return _decode(io.BytesIO(data), name)
@@ -39,8 +67,10 @@ def decode_image(data: bytes, name: str) -> np.ndarray:
 
 def _decode(source: Path | io.BytesIO, name: str) -> np.ndarray:
     try:
-        with warnings.catch_warnings(action="ignore"), Image.open(source) as image:  # what matters of them is an error
-            return _convert(ImageOps.exif_transpose(image), name)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # what matters of them is an error
+            with Image.open(source) as image:
+                return _convert(ImageOps.exif_transpose(image), name)
     except UnidentifiedImageError as error:
         kind = "a HEIC image, which cannot" if name.lower().endswith((".heic", ".heif")) else "no image that can"
         raise ValueError(f"{name} is {kind} be read: save it as PNG, JPEG, WebP or TIFF") from error

@@ -18,7 +18,8 @@ from collections.abc import Callable, Collection, Iterable, Mapping, MutableMapp
 from pathlib import Path
 from typing import Any
 
-from mmgsd.config import PRESETS, Paths, TrainConfig, find_root
+from mmgsd.config import PRESETS, Paths, TrainConfig, find_root, find_shipped
+from mmgsd.experiments import list_rows
 
 Reader = Callable[[str, Any], Any]
 ADDRESS = re.compile(r"((tcp|tls|ws|wss|ucx)://)?(?P<host>\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+):(?P<port>[0-9]{1,5})")
@@ -63,7 +64,7 @@ def check_images(paths: Paths, objects: Iterable[str], *, split: str = "test") -
 
 def check_training(paths: Paths, models: Iterable[TrainConfig], *, overwrite: bool = False) -> None:
     """ValueError where images are missing that ``models`` need: test images, and training images of what is trained."""
-    from mmgsd.learn.training import WEIGHTS  # with torch: not in every notebook that reads parameters
+    from mmgsd.learn.checkpoints import WEIGHTS  # with torch: not in every notebook that reads parameters
 
     there = {model: (paths.model(model) / WEIGHTS).is_file() and not overwrite for model in models}
     check_images(paths, sorted({model.object for model in there}))
@@ -77,7 +78,7 @@ def read_preset(name: str, value: Any) -> str:
 
 def read_method(name: str, value: Any) -> str:
     """The name of a model of the main table, which has the same in every preset."""
-    return one_of(PRESETS["smoke"].main_table("cloth"))(name, value)
+    return one_of([row.name for row in list_rows("main")])(name, value)
 
 
 def one_of(choices: Collection[str]) -> Reader:
@@ -197,7 +198,7 @@ def read_scheduler(name: str, value: Any) -> str:
 
 def read_weights(name: str, value: Any) -> str:
     """Trained weights: the name of a model in data/weights, or a safetensors file (see `find_file`)."""
-    shipped = sorted(path.stem for path in (find_root() / "data" / "weights").glob("*.safetensors"))
+    shipped = sorted(path.stem for path in find_shipped().glob("*.safetensors"))
     if value in shipped:
         return value
     try:

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from pathlib import Path
 
 import pytest
 
 from mmgsd import config as config_module
 from mmgsd.config import (
-    CONTRASTIVE_MARGIN,
-    LONGER,
     METHODS,
     OBJECTS,
     EvaluateConfig,
@@ -22,7 +19,6 @@ from mmgsd.config import (
     find_root,
     from_dict,
     load_preset,
-    read_flag,
     to_dict,
 )
 
@@ -67,34 +63,6 @@ def test_paper_preset_has_the_papers_sizes() -> None:
         (3500, 500, (640, 480)),
     }
     assert (preset.evaluate.pairs, preset.evaluate.points) == (500, 625)
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_methods_of_a_preset_differ_in_the_loss_alone(method: str) -> None:
-    preset = load_preset("quick")
-    model, mmgsd = preset.method("cloth", method), preset.train["cloth"]
-    assert dataclasses.replace(model, method="mmgsd", margin=mmgsd.margin) == mmgsd
-    assert (model.margin == CONTRASTIVE_MARGIN) == (method in ("pcl", "spcl"))
-
-
-def test_any_model_of_the_main_table_is_found_by_its_name() -> None:
-    preset = load_preset("quick")
-    assert preset.method("rope", "mmgsd_long").steps == LONGER * preset.method("rope", "mmgsd").steps
-    finer = preset.method("rope", "mmgsd_fine")
-    assert finer.trunk_weights == preset.method("rope", "mmgsd_long").name and finer.input_px == 192
-    deeper = preset.method("rope", "mmgsd_fine_deep")
-    assert dataclasses.replace(deeper, network="lite0", trunk_weights=finer.trunk_weights) == finer
-    assert deeper.trunk_weights == finer.name
-    muon = preset.method("rope", "mmgsd_muon")
-    assert (muon.steps, muon.input_px, muon.network) == (LONGER * preset.train["rope"].steps, 256, "lite0x2fine")
-    assert preset.method("cloth", "spcl_dense").dense_weight == 1
-    deep = preset.method("cloth", "spcl_deep")
-    assert dataclasses.replace(deep, network="lite0") == preset.method("cloth", "spcl_dense")
-    assert deep.network == preset.method("cloth", "mmgsd_deep").network
-    reference = load_preset("paper").method("rope", "spcl_reference")
-    assert (reference.steps, reference.margin, reference.network, reference.input_px) == (3500, 0.5, "resnet34", 320)
-    with pytest.raises(ValueError, match="method must be one of 'pcl', .*'mmgsd_long'.*got 'mmgsd_lang'"):
-        preset.method("cloth", "mmgsd_lang")
 
 
 def test_unknown_preset_names_the_accepted_ones() -> None:
@@ -196,13 +164,6 @@ def test_digest_changes_with_every_field(config: RenderConfig | TrainConfig | Ev
     assert digest(dataclasses.replace(config, **{name: other})) != digest(config)
 
 
-def test_models_whose_results_are_kept_keep_their_names() -> None:
-    runs = json.loads((find_root() / "data" / "results" / "paper" / "runs.json").read_text())
-    preset = load_preset("paper")
-    named = {f"{name}-{method}": m.name for name in OBJECTS for method, m in preset.main_table(name).items()}
-    assert {key: run["model"] for key, run in runs.items()}.items() <= named.items()
-
-
 def test_integer_and_float_are_one_configuration() -> None:
     assert digest(TrainConfig(sigma_px=1)) == digest(TrainConfig(sigma_px=1.0))
 
@@ -235,17 +196,3 @@ def test_find_root_without_a_repository(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(config_module, "__file__", str(tmp_path / "site" / "config.py"))
     with pytest.raises(FileNotFoundError, match="environment.lock.*MMGSD_ROOT"):
         find_root(tmp_path)
-
-
-@pytest.mark.parametrize(("value", "flag"), [
-    (True, True), (False, False), ("false", False), ("False", False), (" NO ", False), ("off", False), (0, False),
-    ("true", True), ("yes", True), ("1", True), (1, True),
-])  # fmt: skip
-def test_flags_take_their_usual_spellings(value, flag):
-    assert read_flag("overwrite", value) is flag
-
-
-@pytest.mark.parametrize("value", ["maybe", "", 2, None, [], "truefalse"])
-def test_what_is_no_flag_is_refused_by_name(value):
-    with pytest.raises(ValueError, match="overwrite must be true or false"):
-        read_flag("overwrite", value)

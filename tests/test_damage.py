@@ -21,8 +21,9 @@ from mmgsd.dataset_format import TABLES
 from mmgsd.extras import packing, shipping
 from mmgsd.files import DamagedFileError
 from mmgsd.learn import training
-from mmgsd.learn.training import CHECKPOINT, WEIGHTS, train_model
-from mmgsd.match.matcher import Match
+from mmgsd.learn.checkpoints import CHECKPOINT, WEIGHTS, describe_run
+from mmgsd.learn.training import train_model
+from mmgsd.match.match import Match
 from mmgsd.measure import matrix
 from mmgsd.measure.evaluation import evaluate_baseline, load_queries, write_results
 from mmgsd.measure.figure_data import FigureData, load_figure_data, save_figure_data
@@ -90,7 +91,7 @@ def of_data_set(name: str) -> Callable[..., None]:
 def use_weights(folder: Path, damage: Callable[[bytes], bytes], dataset: Path, model: Path) -> None:
     weights = folder / WEIGHTS
     weights.write_bytes(damage((model / WEIGHTS).read_bytes()))
-    training.describe_run(weights)
+    describe_run(weights)
 
 
 def use_checkpoint(folder: Path, damage: Callable[[bytes], bytes], dataset: Path, model: Path) -> None:

@@ -94,3 +94,9 @@ def test_a_lock_names_the_process_that_holds_it_and_ends_with_it(tmp_path):
     other.wait()
     with files.locked(folder, "training"):
         assert f"process {os.getpid()}" in (tmp_path / ".set.lock").read_text()
+
+
+def test_no_process_is_signalled_where_signal_0_is_ctrl_c(monkeypatch):
+    monkeypatch.setattr(os, "kill", lambda *_: pytest.fail("sends Ctrl-C on Windows"))
+    monkeypatch.setattr(os, "name", "nt")
+    assert files._is_running("", 1)

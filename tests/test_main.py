@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
 import numpy as np
 import onnxruntime
+import pandas as pd
 import pytest
 import torch
 from PIL import Image
@@ -14,10 +16,12 @@ from PIL import Image
 from mmgsd.__main__ import main
 from mmgsd.config import TrainConfig
 from mmgsd.dataset import load_dataset
+from mmgsd.images import read_mask
 from mmgsd.learn.training import train_model
-from mmgsd.match.matcher import Matcher, load
+from mmgsd.match.matcher import Matcher, Pair, load
 
 CONFIG = TrainConfig(steps=1, batch=2, pairs=2, queries=4, input_px=64, descriptor_dim=4)
+SIZES = [(300, 200), (120, 160)]  # of the images
 
 
 @pytest.fixture(scope="module")
@@ -25,12 +29,43 @@ def weights(cloth_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     return train_model(CONFIG, cloth_dataset, tmp_path_factory.mktemp("model"), device="cpu", progress=False)
 
 
+@pytest.fixture(scope="module")
+def seeing(cloth_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Weights of a network with heads, which have learnt as good as nothing."""
+    config = dataclasses.replace(CONFIG, heads=True)
+    return train_model(config, cloth_dataset, tmp_path_factory.mktemp("seeing"), device="cpu", progress=False)
+
+
+@pytest.fixture
+def masks(tmp_path: Path) -> list[str]:
+    """Of each image a mask, the object in its left half."""
+    paths = [tmp_path / "masks" / f"{k}.png" for k in (0, 1)]
+    paths[0].parent.mkdir()
+    for path, (width, height) in zip(paths, SIZES, strict=True):
+        grey = np.full((height, width), 100, np.uint8)
+        grey[:, : width // 2] = 140
+        Image.fromarray(grey).save(path)
+    return [str(path) for path in paths]
+
+
+@pytest.fixture
+def frames(images: list[str], tmp_path: Path) -> Path:
+    """A folder of three images, of which one is damaged, and of something else."""
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    for name in ("a.png", "c.png"):
+        Image.open(images[1]).save(folder / name)
+    (folder / "b.png").write_bytes(Path(images[0]).read_bytes()[:200])
+    (folder / "notes.txt").write_text("of the day")
+    return folder
+
+
 @pytest.fixture
 def images(cloth_dataset: Path, tmp_path: Path) -> list[str]:
     """Two files of other sizes and kinds than the training's."""
     data, paths = load_dataset(cloth_dataset), [tmp_path / "a.png", tmp_path / "b.jpg"]
-    Image.fromarray(data.load_image(0)).resize((300, 200)).convert("RGBA").save(paths[0])
-    Image.fromarray(data.load_image(1)).resize((120, 160)).save(paths[1])
+    Image.fromarray(data.load_image(0)).resize(SIZES[0]).convert("RGBA").save(paths[0])
+    Image.fromarray(data.load_image(1)).resize(SIZES[1]).save(paths[1])
     return [str(path) for path in paths]
 
 
@@ -86,7 +121,10 @@ def test_the_picture_is_drawn(weights, images, capsys, tmp_path, pixels):
         ({"--weights": "towel"}, 2, "towel must be a safetensors file or one of 'cloth', "),
         ({"--out": "match.txt"}, 2, "argument --out: must end with .png"),
         ({"image1": "nowhere.png"}, 2, "nowhere.png does not exist"),
-        ({"image1": "."}, 2, ". is a folder"),
+        ({"image1": str(Path(__file__).parent)}, 2, "tests holds no image: its files must end with one of .png"),
+        ({"--pictures": "there"}, 2, "--pictures must be given with a folder as image1"),
+        ({"--mask1": "nowhere.png"}, 2, "nowhere.png does not exist"),
+        ({"--mask0": __file__}, 2, "is no image that can be read"),
         ({"image1": __file__}, 2, "is no image that can be read"),
     ],
 )
@@ -97,6 +135,146 @@ def test_what_is_wrong_is_said(weights, images, capsys, changed, code, message):
     said = fail(capsys, code, "match", *arguments)
     assert message in said
     assert said.startswith("usage: ") or (said.startswith("error: ") and said.count("\n") == 1)
+
+
+def test_a_mask_tells_where_the_object_is(weights, images, masks, capsys):
+    asked = ["match", *images, "--xy", "10,20", "--xy", "290,20", "--weights", weights]
+    asked += ["--mask0", masks[0], "--mask1", masks[1]]
+    on, off = run(capsys, *asked).splitlines()
+    assert on.count("px)") == 4 and off == "290,20 -> background: the pixel is not on the object (100% sure)"
+    on, off = json.loads(run(capsys, *asked, "--json"))
+    assert (on["on_object"], on["absent"], on["said"], off["on_object"]) == (1, 0, "", 0)
+    assert all(mode["xy"][0] < 80 for mode in on["modes"])
+    assert {mode["confidence"] for mode in off["modes"]} == {0}
+    assert "background" in off["said"]
+
+
+@pytest.mark.parametrize(
+    ("fill", "size", "message"),
+    [
+        (255, (160, 120), "must be a mask of its image's 300 x 200 px, got 160 x 120 px"),
+        (1, SIZES[0], "must be a mask that is brighter than half on the object, got one darker everywhere"),
+    ],
+)
+def test_another_mask_is_refused(weights, images, capsys, tmp_path, fill, size, message):
+    Image.new("L", size, fill).save(tmp_path / "mask.png")
+    asked = ["match", *images, "--xy", "5,5", "--weights", weights, "--mask0", tmp_path / "mask.png"]
+    assert f"mask.png {message}" in fail(capsys, 2, *asked)
+
+
+def test_what_the_heads_say_is_printed(seeing, images, capsys, monkeypatch):
+    asked = ["match", *images, "--xy", "10,20", "--weights", seeing]
+    (query,) = json.loads(run(capsys, *asked, "--json"))
+    assert query.keys() >= {"on_object", "absent", "said"} and all(0 <= m["visible"] <= 1 for m in query["modes"])
+    look = Pair._look
+    for name, value, said in (("absent", 0.9, "absent: image1"), ("on_object", 0.1, "background: "), ("", 0, "hidden")):
+        sure = {"absent": np.zeros(1), "on_object": np.ones(1), "visible": np.zeros((1, 4)), name: np.full(1, value)}
+        sure.pop("", None)
+        monkeypatch.setattr(Pair, "_look", lambda *_, sure=sure: sure)
+        assert said in run(capsys, *asked)
+    monkeypatch.setattr(Pair, "_look", look)
+
+
+def test_a_segmented_image_is_a_mask(seeing, images, capsys, tmp_path, monkeypatch):
+    shown = np.zeros(SIZES[0][::-1], np.float32)
+    shown[:, :100] = 0.51
+    monkeypatch.setattr(Matcher, "segment", lambda *_: shown)
+    out = tmp_path / "new" / "mask.png"
+    assert "33% of the image" in run(capsys, "segment", images[0], out, "--weights", seeing)
+    np.testing.assert_array_equal(read_mask(out, shown.shape), shown > 0.5)
+
+
+def test_what_cannot_be_segmented_is_said(weights, images, capsys, tmp_path):
+    assert "learnt no mask" in fail(capsys, 2, "segment", images[0], tmp_path / "m.png", "--weights", weights)
+    assert "out must end with .png" in fail(capsys, 2, "segment", images[0], "m.jpg", "--weights", weights)
+    assert "must not be the image itself" in fail(capsys, 2, "segment", images[0], images[0], "--weights", weights)
+
+
+def test_a_folder_is_answered_for_but_for_what_is_damaged(weights, images, frames, capsys, tmp_path):
+    asked = ["match", images[0], frames, "--xy", "5,5", "--xy", "100,60", "--weights", weights, "--json"]
+    with pytest.raises(SystemExit) as stopped:
+        main([str(a) for a in [*asked, "--csv", tmp_path / "all.csv", "--pictures", tmp_path / "drawn"]])
+    printed = capsys.readouterr()
+    assert stopped.value.code == 1
+    assert "b.png is a damaged image" in printed.err
+    assert printed.err.endswith("error: 1 of 3 images could not be answered for: b.png\n")
+    lines = [json.loads(line) for line in printed.out.splitlines()]
+    assert [line["image1"] for line in lines] == ["a.png", "c.png"]
+    alone = json.loads(run(capsys, "match", images[0], frames / "c.png", *asked[3:]))
+    assert lines[1]["queries"] == alone
+    table = pd.read_csv(tmp_path / "all.csv")
+    assert len(table) == 2 * 2 * 4 and table.image1.unique().tolist() == ["a.png", "c.png"]
+    expected = [mode["xy"][0] for query in alone for mode in query["modes"]]
+    assert table[table.image1 == "c.png"].x1.tolist() == expected
+    assert sorted(path.name for path in (tmp_path / "drawn").iterdir()) == ["a.png.png", "c.png.png"]
+
+
+def test_one_image_may_have_a_table_too(seeing, images, capsys, tmp_path):
+    out = tmp_path / "new" / "one.csv"
+    (query,) = json.loads(run(capsys, "match", *images, "--xy", "5,5", "--weights", seeing, "--csv", out, "--json"))
+    table = pd.read_csv(out)
+    assert table["mode"].tolist() == [1, 2, 3, 4] and set(table.image1) == {"b.jpg"}
+    assert table.visible.tolist() == [mode["visible"] for mode in query["modes"]]
+    assert set(table.absent) == {query["absent"]} and set(table.on_object) == {query["on_object"]}
+
+
+def test_a_folder_without_damage_is_a_success(weights, images, frames, capsys):
+    (frames / "b.png").unlink()
+    first, second = run(capsys, "match", images[0], frames, "--xy", "5,5", "--weights", weights).splitlines()
+    assert first.startswith("a.png 5,5 -> ") and second == first.replace("a.png", "c.png")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("--out m.png", "--out, --mask0 and --mask1 must be given with one image1"),
+        ("--mask1 m.png", "--out, --mask0 and --mask1 must be given with one image1"),
+        ("--pictures FRAMES", "--pictures must not be a folder of the images"),
+        ("--csv FRAMES/a.png", "--csv must not be one of the images"),
+        ("--xy 9000,3", "xy must be finite and inside image0 of 300 x 200 px"),
+    ],
+)
+def test_what_is_wrong_with_a_folder_is_said_at_once(weights, images, frames, capsys, words, message):
+    words = words.replace("FRAMES", str(frames)).split()
+    asked = ["match", images[0], frames, "--xy", "5,5", "--weights", weights, *words]
+    said = fail(capsys, 2, *asked)
+    assert message in said and "skipped" not in said
+
+
+@pytest.fixture
+def marked(images, tmp_path) -> Path:
+    """Two marked photographs."""
+    folder = tmp_path / "photographs"
+    folder.mkdir()
+    for name in "ab":
+        Image.open(images[0]).convert("RGB").save(folder / f"{name}.png")
+    corners = [[50, 50], [100, 50], [100, 100], [50, 100]]
+    (folder / "index.json").write_text(json.dumps([{"file": f"{n}.png", "corners": corners} for n in "ab"]))
+    return folder
+
+
+def test_photographs_are_measured(weights, marked, capsys, tmp_path, monkeypatch):
+    monkeypatch.setattr("mmgsd.measure.photographs.find_root", lambda: tmp_path)
+    asked = ["measure", marked, "--weights", weights]
+    table = run(capsys, *asked, "--out", tmp_path / "sheet.png", "--store", "mine")
+    assert table.splitlines()[-1].split()[:2] == ["all", "8"]
+    assert Image.open(tmp_path / "sheet.png").size[0] > 300
+    results = json.loads(run(capsys, *asked, "--json"))
+    assert json.loads((tmp_path / "data" / "results" / "photographs_mine.json").read_text()) == results
+    assert results["photographs"] == 2 and results["sources"].keys() == {"own"}
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("--out MARKED/a.png", "--out must not replace a file among the photographs"),
+        ("--store ../mine", "name must be of letters, digits, - and _, got '../mine'"),
+        ("--weights towel", "towel must be a safetensors file or one of 'cloth', "),
+    ],
+)
+def test_what_is_wrong_with_photographs_is_said(weights, marked, capsys, words, message):
+    words = words.replace("MARKED", str(marked)).split()
+    assert message in fail(capsys, 2, "measure", marked, "--weights", weights, *words)
 
 
 def test_the_picture_does_not_replace_an_image(weights, images, capsys):

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import ast
 import os
+import re
 import shutil
 import subprocess
+import sys
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
+import tomllib
+from packaging.requirements import Requirement
 
-MAKEFILE = Path(__file__).resolve().parents[1] / "Makefile"
+ROOT = Path(__file__).resolve().parents[1]
+MAKEFILE = ROOT / "Makefile"
 # Stands for Python and pip: it writes down what it was asked, and makes and empties .venv as venv does.
 PYTHON = """#!/bin/sh
 echo "$@" >> "$LOG"
@@ -116,3 +123,33 @@ def test_every_target_is_listed(checkout: Checkout) -> None:
     assert all(
         f"make {name} " in listed for name in ("reproduce", "test", "data-pack", "data-unpack", ".venv", "clean")
     )
+
+
+def test_the_lock_has_a_fitting_version_of_every_requirement_and_extra() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    asked = [*project["dependencies"], *sum(project["optional-dependencies"].values(), [])]
+    pins = dict(re.findall(r"^([\w.-]+)==([^ \\;]+)", (ROOT / "environment.lock").read_text(), re.MULTILINE))
+    for requirement in map(Requirement, asked):
+        assert requirement.specifier.contains(pins[requirement.name]), requirement
+
+
+def test_every_imported_package_is_a_requirement() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    light = {Requirement(line).name for line in project["dependencies"]}
+    full = light | {Requirement(line).name for extra in ("render", "notebooks") for line in extras[extra]}
+    distributions = packages_distributions()
+    for path in (ROOT / "mmgsd").rglob("*.py"):
+        for package in list_imports(path) - {*sys.stdlib_module_names, "mmgsd", "mathutils"}:  # the last comes with bpy
+            assert full & {name.lower().replace("_", "-") for name in distributions[package]}, (path, package)
+
+
+def list_imports(path: Path) -> set[str]:
+    """The top-level packages that a module imports, at its top or within."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name.partition(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            found.add(node.module.partition(".")[0])
+    return found

@@ -91,7 +91,7 @@ def list_assigned(source: str) -> list[str]:
 FLAGS = {
     "01_render_data": ("overwrite", "only_test"), "03_train": ("overwrite",), "04_evaluate": ("overwrite",),
     "05_sigma_ablation": ("overwrite",), "06_uncertainty": ("overwrite",), "08_symmetry_study": ("overwrite",),
-    "run_all": ("overwrite",), "your_object": ("overwrite",),
+    "11_broken_symmetry": ("overwrite",), "run_all": ("overwrite",), "your_object": ("overwrite",),
 }  # fmt: skip
 WRONG = [  # notebook, parameter, what it was given, what the error says besides the parameter's name
     *((path.stem, "preset", value, PRESETS) for path in CHECKED for value in ("papr", 3, None, ["quick"])
@@ -139,10 +139,10 @@ WRONG = [  # notebook, parameter, what it was given, what the error says besides
     ("08_symmetry_study", "groups", [], "from 1 on"),
     ("08_symmetry_study", "groups", ["c5"], "'v4', 'c4', 'd4'"),
     ("08_symmetry_study", "groups", "c4 own", "got 'own'"),
-    ("08_symmetry_study", "fixes", "quik", 'did you mean \'quick\'?), got \'quik\'; or "" for none'),
-    ("08_symmetry_study", "fixes", 1, PRESETS),
+    ("11_broken_symmetry", "images", "quik", 'did you mean \'quick\'?), got \'quik\'; or "" for none'),
+    ("11_broken_symmetry", "images", 1, PRESETS),
     ("09_error_analysis", "method", "mmgsdd", "did you mean 'mmgsd'?"),
-    ("09_error_analysis", "method", "sift", "'mmgsd', 'spcl_dense'"),
+    ("09_error_analysis", "method", "sift", "'mmgsd', 'mmgsd_deep'"),
     ("09_error_analysis", "method", None, "'mmgsd'"),
     ("09_error_analysis", "objects", "cloth towel", "'cloth', 'rope'"),
     ("09_error_analysis", "objects", "", "from 1 on"),
@@ -189,8 +189,8 @@ RIGHT = [  # notebook, parameter, as papermill or a person may write it, what th
     ("05_sigma_ablation", "steps", "1000", 1000),
     ("06_uncertainty", "classical", "['sift', 'orb']", ["sift", "orb"]),
     ("08_symmetry_study", "groups", "[c4, v4]", ["c4", "v4"]),
-    ("08_symmetry_study", "fixes", "", ""),
-    ("08_symmetry_study", "fixes", None, ""),
+    ("11_broken_symmetry", "images", "", ""),
+    ("11_broken_symmetry", "images", None, ""),
     ("09_error_analysis", "objects", "cloth rope", ["cloth", "rope"]),
     ("09_error_analysis", "objects", "cloth", ["cloth"]),
     ("09_error_analysis", "objects", ["rope"], ["rope"]),

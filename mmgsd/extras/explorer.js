@@ -9,7 +9,8 @@ const PARTS = { heatmap: "h", modes: "m", "true matches": "t" };
 const HELP = [["click, drag", "ask"], ["shift + click", "pin"], ["ctrl + wheel", "zoom"], ["alt + drag", "move"],
   ["p", "previous"], ["r", "random"], ["n", "next"], ["h", "heatmap"], ["m", "modes"], ["t", "true matches"],
   ["v", "move or ask"], ["+", "closer"], ["-", "farther"], ["0", "fit"], ["c", "clear"], ["f", "full screen"],
-  ["s", "save picture"], ["j", "save JSON"]];
+  ["s", "save picture"], ["j", "save JSON"],
+  ["k", "save marks"]];
 
 class Explorer {
   constructor(model) {
@@ -41,7 +42,8 @@ class Explorer {
     this.line = make("div", { className: "mmgsd-line", ariaLive: "polite" });
     this.tables = make("div", { className: "mmgsd-tables" });
     this.savers = [button("save picture", "Both pictures with their marks, as PNG (s)", () => this.savePicture()),
-      button("save JSON", "The answer, as of python -m mmgsd match --json (j)", () => this.saveJson())];
+      button("save JSON", "The answer, as of python -m mmgsd match --json (j)", () => this.saveJson()),
+      button("save marks", "Points pinned on left images, for python -m mmgsd measure (k)", () => this.saveMarks())];
     this.clearer = button("clear points", "Forget all points (c)", () => this.send({ do: "clear" }));
     this.box = make("div", { className: "mmgsd-explorer", tabIndex: 0 },
       make("div", { className: "mmgsd-bar" },
@@ -211,7 +213,7 @@ class Explorer {
       p: step("previous"), r: step("random"), n: step("next"), v: () => this.setMoving(!this.moving),
       "+": () => this.zoom(1.5), "=": () => this.zoom(1.5), "-": () => this.zoom(1 / 1.5), 0: () => this.fit(),
       c: () => this.send({ do: "clear" }), f: () => this.toggleScreen(),
-      s: () => this.savePicture(), j: () => this.saveJson(),
+      s: () => this.savePicture(), j: () => this.saveJson(), k: () => this.saveMarks(),
       ...Object.fromEntries(Object.entries(PARTS).map(([part, key]) => [key, () => this.toggle(part)])),
     }[event.key.toLowerCase()];
     if (!act) return;
@@ -265,19 +267,20 @@ class Explorer {
     const hot = side === 1 && this.heat && this.shown.has("heatmap");
     drawImage(context, place, bitmaps[hot ? 2 : side], sizes[side]);
     if (hot) drawImage(context, place, this.heat, sizes[side], true);
-    this.queries.forEach(({ xy, modes }, k) => {
+    this.queries.forEach(({ xy, modes, said }, k) => {
       const { ellipses, matches } = this.answer.points[k];
       const colour = COLOURS[k % COLOURS.length];
       if (side === 0) return drawPixel(context, place, unit, colour, xy);
       const thick = (m) => (this.lit?.[0] === k && this.lit[1] === m ? 2 * unit : unit);
       if (this.shown.has("modes")) {
-        ellipses.forEach((mode, m) => drawMode(context, place, thick(m), colour, mode, modes[m].weight));
+        const how = (m) => ({ hidden: isHidden(modes[m]), faint: said });
+        ellipses.forEach((mode, m) => drawMode(context, place, thick(m), colour, mode, modes[m].weight, how(m)));
       }
       if (this.shown.has("true matches")) matches.forEach((match) => drawCross(context, place, unit, colour, match));
     });
   }
 
-  makeTable({ xy, modes, entropy, outside }, k) {
+  makeTable({ xy, modes, entropy, outside, said }, k) {
     const dot = () => make("span", { className: "mmgsd-dot", style: `background: ${COLOURS[k % COLOURS.length]}` });
     const row = (kind, cells) => make("tr", {}, ...cells.map((cell) => make(kind, {}, ...[cell].flat())));
     const percent = (value) => `${(100 * value).toFixed(0)} %`;
@@ -286,7 +289,8 @@ class Explorer {
     const rows = modes.map((mode, m) => {
       const [x, y] = mode.xy.map((value) => value.toFixed(1));
       const spread = `± ${mode.spread_px.toFixed(0)} px`;
-      const node = row("td", [[dot(), `${m + 1}`], x, y, share(mode.weight), spread, share(mode.confidence)]);
+      const seen = mode.visible === undefined ? [] : [`${isHidden(mode) ? "hidden" : "seen"}, ${percent(mode.visible)}`];
+      const node = row("td", [[dot(), `${m + 1}`], x, y, share(mode.weight), spread, share(mode.confidence), ...seen]);
       const light = (lit) => () => {
         this.lit = lit;
         this.draw();
@@ -295,9 +299,11 @@ class Explorer {
     });
     const place = xy.map((value) => value.toFixed(0)).join(", ");
     const rest = ` at (${place}) · entropy ${entropy.toFixed(1)} nats · ${percent(outside)} outside the modes`;
-    const head = row("th", ["mode", "x px", "y px", "weight", "spread", "confidence"]);
-    head.lastChild.title = "How probable a true match within 20 px is";
-    return make("table", {}, make("caption", {}, dot(), make("b", { textContent: `Point ${k + 1}` }), rest),
+    const known = modes[0]?.visible === undefined ? [] : ["seen there"];
+    const head = row("th", ["mode", "x px", "y px", "weight", "spread", "confidence", ...known]);
+    head.children[5].title = "How probable a true match within 20 px is";
+    const why = said ? [make("div", { className: "mmgsd-why", textContent: said })] : [];
+    return make("table", {}, make("caption", {}, dot(), make("b", { textContent: `Point ${k + 1}` }), rest, ...why),
       make("thead", {}, head), make("tbody", {}, ...rows));
   }
 
@@ -325,7 +331,15 @@ class Explorer {
   saveJson() {
     if (this.queries?.length) download(new Blob([this.answer.json, "\n"], { type: "application/json" }), "mmgsd.json");
   }
+
+  saveMarks() {
+    const marks = this.model.get("marks");
+    if (marks === "[]") return this.say("Pin points on the left image first: shift + click.", true);
+    download(new Blob([marks, "\n"], { type: "application/json" }), "index.json");
+  }
 }
+
+const isHidden = ({ visible }) => visible < 0.5; // where it is known
 
 function makeLegend(colours) {
   const bar = make("canvas", { width: 64, height: 10, style: "border-radius: 2px" });
@@ -339,6 +353,7 @@ function makeLegend(colours) {
     [sign((...where) => drawPixel(...where, [0, 0])), "asked pixel"],
     [sign((...where) => drawMode(...where, mode, 0.25)), "mode, larger with its weight"],
     [sign((...where) => drawMode(...where, { ...mode, major: 15, minor: 9 }, 0)), "its spread, 1 std"],
+    [sign((...where) => drawMode(...where, mode, 0.25, { hidden: true })), "hidden there, where known"],
     [sign((...where) => drawCross(...where, [0, 0])), "true match, where known"],
     [bar, "heatmap of the last point, up to its maximum"],
   ];

@@ -22,12 +22,14 @@ import cv2
 import numpy as np
 import traitlets
 
-from mmgsd.__main__ import describe_answer
+from mmgsd.experiments import get_label
 from mmgsd.extras.explorer_scenes import Scene
-from mmgsd.figures.style import FADED, HEAT, METHOD_LABELS, compute_ellipse, compute_strength, fade_image
+from mmgsd.figures.style import FADED, HEAT, compute_ellipse, compute_strength, fade_image
 from mmgsd.images import decode_image
-from mmgsd.match.baselines import BaselineMatcher
+from mmgsd.match.baselines import FeatureMatcher
+from mmgsd.match.describe import describe_answer
 from mmgsd.match.match import Match
+from mmgsd.measure.photographs import describe_marks
 
 QUALITY = 90  # of what the browser is sent, JPEG
 DISPLAY_PX = 1600  # longer side of what the browser is sent
@@ -45,6 +47,7 @@ class Pictures(anywidget.AnyWidget):
     _esm = "\n".join(Path(__file__).with_name(name).read_text("utf-8") for name in SCRIPTS)
     _css = Path(__file__).with_name("explorer.css")
     pair = traitlets.Dict().tag(sync=True)  # id, number, count, names, sizes; JPEG image0, image1, faded1; truth
+    marks = traitlets.Unicode("[]").tag(sync=True)  # JSON for ``python -m mmgsd measure``: what is pinned on the left
     answer = traitlets.Dict().tag(sync=True)  # pair, number, milliseconds, json, points, heat, heat_size
     methods = traitlets.List().tag(sync=True)  # [name, label] of each
     method = traitlets.Unicode().tag(sync=True)
@@ -58,7 +61,7 @@ class Pictures(anywidget.AnyWidget):
 class Explorer:
     """The two pictures with everything around them; ``show()`` them in a notebook.
 
-    ``matchers`` {name: `Matcher` or `BaselineMatcher`}; ``scenes`` are pairs of images, or functions that load one.
+    ``matchers`` {name: `Matcher` or `FeatureMatcher`}; ``scenes`` are pairs of images, or functions that load one.
     Click or drag in the left image; ``ask(x, y)`` does the same from code.
     """
 
@@ -66,8 +69,8 @@ class Explorer:
         if not matchers or not scenes:
             raise ValueError("matchers and scenes must not be empty")
         self.matchers, self.scenes, self.pairs_opened, self.answers = dict(matchers), list(scenes), 0, 0
-        self.rng, self._own, self._parts = np.random.default_rng(), None, {}
-        methods = [[name, METHOD_LABELS.get(name, name)] for name in self.matchers]
+        self.rng, self._own, self._parts, self.marks = np.random.default_rng(), None, {}, {}
+        methods = [[name, get_label(name, short=True)] for name in self.matchers]
         self.pictures = Pictures(methods=methods, method=methods[0][0])
         self.pictures.on_msg(self._on_message)
         self.open(0)
@@ -93,6 +96,8 @@ class Explorer:
             raise ValueError(f"{MOST_PINS} points are pinned, and there are no colours for more: clear them first")
         answer = self._answer([*pins, xy])
         self.pins, self.xy = (pins + [xy], None) if pin else (pins, xy)
+        if pin:
+            self._mark()
         return answer
 
     @property
@@ -120,6 +125,15 @@ class Explorer:
         """Forget every pixel that was asked about."""
         self.pins, self.xy = [], None
         self._answer([])
+        self._mark()
+
+    def _mark(self) -> None:
+        """Take what is pinned for the marked places of the left image; they stay when another is opened."""
+        file, kind = self.scene.name0, getattr(self.matchers[self.method], "object", "")
+        self.marks.pop(file, None)
+        if self.pins:
+            self.marks[file] = describe_marks(file, self.pins, kind)
+        self.pictures.marks = json.dumps(list(self.marks.values()), indent=1)
 
     def open_own(self, side: int, image: np.ndarray, name: str) -> None:
         """Show the user's image as the left (0) or right (1) one beside what is there; a pair after all others."""
@@ -147,7 +161,7 @@ class Explorer:
         name = self.method
         if name not in self._prepared:
             matcher, scene = self.matchers[name], self.scene
-            baseline = isinstance(matcher, BaselineMatcher)
+            baseline = isinstance(matcher, FeatureMatcher)
             self._prepared[name] = (
                 prepare_baseline(matcher, scene) if baseline else matcher.prepare(scene.image0, scene.image1).match
             )
@@ -231,8 +245,8 @@ def describe_ellipses(match: Match, query: int = 0) -> list[dict[str, float]]:
     return described
 
 
-def prepare_baseline(matcher: BaselineMatcher, scene: Scene) -> Callable[[np.ndarray], Match]:
-    """Answers of hand-made descriptors, which see large images made smaller; pixels (S, 2) are those of the large."""
+def prepare_baseline(matcher: FeatureMatcher, scene: Scene) -> Callable[[np.ndarray], Match]:
+    """Answers of baselines, which see large images made smaller; pixels (S, 2) are those of the large."""
     small = [_shrink(image, BASELINE_PX) for image in (scene.image0, scene.image1)]
     size = (small[1].shape[1], small[1].shape[0])
     mask = None if scene.mask1 is None else cv2.resize(scene.mask1.astype(np.uint8), size, interpolation=0).astype(bool)

@@ -44,13 +44,17 @@ function drawPixel(context, place, unit, colour, [x, y]) {
   context.stroke();
 }
 
-function drawMode(context, place, unit, colour, { x, y, major, minor, angle }, weight) {
+function drawMode(context, place, unit, colour, { x, y, major, minor, angle }, weight, { hidden, faint } = {}) {
+  context.save();
+  context.setLineDash(hidden ? [4 * unit, 3 * unit] : []);
+  context.globalAlpha = faint ? 0.35 : 1;
   context.beginPath();
   context.ellipse(...locate(place, x, y), place.scale * major, place.scale * minor, angle, 0, 2 * Math.PI);
   stroke(context, colour, unit);
   context.beginPath();
   context.arc(...locate(place, x, y), unit * (2 + 8 * Math.sqrt(weight)), 0, 2 * Math.PI);
   stroke(context, colour, 2 * unit);
+  context.restore();
 }
 
 function drawCross(context, place, unit, colour, [x, y]) {

@@ -10,12 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from mmgsd.config import OBJECTS, PRESETS, Paths, find_root, load_preset
+from mmgsd.checks import check_choice
+from mmgsd.config import OBJECTS, PRESETS, Paths, find_root, find_shipped, load_preset
 from mmgsd.dataset import Dataset, load_dataset, sample_pairs
-from mmgsd.figures.style import METHOD_LABELS
+from mmgsd.experiments import configure_study, get_label
 from mmgsd.images import decode_image, to_rgb
-from mmgsd.learn.training import WEIGHTS
-from mmgsd.match.baselines import BaselineMatcher, list_baselines
+from mmgsd.learn.checkpoints import WEIGHTS
+from mmgsd.match.baselines import BASELINES, BaselineMatcher
 from mmgsd.match.matcher import Matcher
 from mmgsd.parameters import find_file
 
@@ -66,19 +67,14 @@ def make_scenes(data: Dataset, *, pairs: int = 50, seed: int = 0) -> list[Callab
     return [lambda a=int(a), b=int(b): make(a, b) for a, b in chosen]
 
 
-def make_own_scene(image0: np.ndarray, image1: np.ndarray) -> Scene:
-    """A scene of a user's own images, of any kind that `Matcher.match` takes."""
-    return Scene(to_rgb(image0, "image0"), to_rgb(image1, "image1"))
-
-
 def choose_scenes(name: str, preset: str = SAMPLE, own_images: Sequence[Path | str] = ()) -> list:
     """The pairs to open for an object: two image files where ``own_images`` names them, else test images of a data set.
 
     ``preset``: "sample" for the images that come with the repository, or a preset whose data set has been rendered.
     Relative paths are those of `find_file`. ValueError names the argument that is wrong.
     """
-    _check_choice("name", name, OBJECTS)
-    _check_choice("preset", preset, (SAMPLE, *PRESETS))
+    check_choice("name", name, OBJECTS)
+    check_choice("preset", preset, (SAMPLE, *PRESETS))
     if isinstance(own_images, str | bytes) or not isinstance(own_images, Sequence) or len(own_images) not in (0, 2):
         raise ValueError(f"own_images must be [] or a list of two image files, got {own_images!r}")
     if own_images:
@@ -93,36 +89,30 @@ def load_matchers(name: str, preset: str = SAMPLE) -> dict[str, Any]:
 
     With the preset "sample", the ones that are trained with "quick".
     """
-    _check_choice("name", name, OBJECTS)
-    _check_choice("preset", preset, (SAMPLE, *PRESETS))
+    check_choice("name", name, OBJECTS)
+    check_choice("preset", preset, (SAMPLE, *PRESETS))
     trained = Paths(find_root(), "quick" if preset == SAMPLE else preset)
     matchers = load_shipped(name)
-    for method, config in load_preset(trained.preset).main_table(name).items():
+    for method, config in configure_study(load_preset(trained.preset), name, "main").items():
         path = trained.model(config) / WEIGHTS
         if path.is_file():
-            matchers[f"{METHOD_LABELS.get(method, method)} ({trained.preset})"] = Matcher.load(path)
-    return matchers | {METHOD_LABELS[method]: BaselineMatcher(method) for method in list_baselines()}
+            matchers[f"{get_label(method, short=True)} ({trained.preset})"] = Matcher.load(path)
+    return matchers | {get_label(method, short=True): BaselineMatcher(method) for method in BASELINES}
 
 
 def load_shipped(name: str) -> dict[str, Matcher]:
     """{label: matcher} of every model in data/weights that is of the object: ``NAME`` (MMGSD) and ``NAME-METHOD``."""
     matchers = {}
-    folder = find_root() / "data" / "weights"
-    for path in sorted(folder.glob("*.safetensors"), key=lambda path: path.stem):
+    for path in sorted(find_shipped().glob("*.safetensors"), key=lambda path: path.stem):
         method = "mmgsd" if path.stem == name else path.stem.removeprefix(f"{name}-")
         if method == path.stem:
             continue
         matcher = Matcher.load(path)
         if matcher.config.object == name:
-            matchers[METHOD_LABELS.get(method, method)] = matcher
+            matchers[get_label(method, short=True)] = matcher
     return matchers
 
 
 def _find_dataset(name: str, preset: str) -> Path:
     root = find_root()
     return root / "data" / "sample" / name if preset == SAMPLE else Paths(root, preset).dataset(name)
-
-
-def _check_choice(argument: str, value: Any, choices: Sequence[str]) -> None:
-    if value not in choices:
-        raise ValueError(f"{argument} must be one of {', '.join(map(repr, choices))}, got {value!r}")

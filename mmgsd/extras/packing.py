@@ -1,10 +1,12 @@
 """Data sets that travel: packed into one small archive each, unpacked and checked elsewhere.
 
 An archive holds the data set in its own format, but for two things: images are WebP at a quality where the eye sees
-no difference, and labels are rounded to 1/16 px. Beside it lies a note (JSON) with its SHA-256, size, seed and quality.
+no difference, and labels are rounded to 1/16 px. Beside it lie a note (JSON) with its SHA-256, size, seed and quality,
+and Croissant metadata for data catalogues.
 
     python -m mmgsd.extras.packing pack paper       data/generated/paper/cloth -> data/packs/paper-cloth.zip + .json
     python -m mmgsd.extras.packing unpack paper     and back
+    python -m mmgsd.extras.packing describe paper   Croissant metadata beside each note, from both
     python -m mmgsd.extras.packing sample paper     24 images of each object -> data/sample/cloth
 """
 
@@ -26,10 +28,12 @@ import pyarrow.parquet as pq
 from PIL import Image
 from tqdm.auto import tqdm
 
+from mmgsd.checks import read_flag
 from mmgsd.command import run_command
-from mmgsd.config import OBJECTS, Paths, find_root, load_preset, read_flag
+from mmgsd.config import OBJECTS, Paths, find_root, load_preset
 from mmgsd.dataset import Dataset, check_dataset, encode_mask, load_dataset
 from mmgsd.dataset_format import SPLITS, TABLES, find_owner, is_member
+from mmgsd.extras.croissant import write_croissant
 from mmgsd.files import (
     DamagedFileError,
     ForeignFileError,
@@ -64,7 +68,9 @@ def pack_dataset(folder: Path, archive: Path, *, quality: int = QUALITY, progres
         with writing(archive) as aside, zipfile.ZipFile(aside, "w", zipfile.ZIP_STORED) as target:
             for name, data in bar:
                 target.writestr(zipfile.ZipInfo(name), data)
-        return _write_note(archive, splits, quality)
+        note = _write_note(archive, splits, quality)
+        write_croissant(archive, splits[0].info, note)
+        return note
 
 
 def _write_note(archive: Path, splits: list[Dataset], quality: int) -> dict:
@@ -78,6 +84,11 @@ def _write_note(archive: Path, splits: list[Dataset], quality: int) -> dict:
     }
     write_json(archive.with_suffix(".json"), note)
     return note
+
+
+def describe_archive(archive: Path, folder: Path) -> Path:
+    """Write the Croissant metadata of an archive, which need not be here, from its note and the data set it packs."""
+    return write_croissant(archive, load_dataset(folder, SPLITS[0]).info, _read_note(archive, alone=True))
 
 
 def _check_replaceable(archive: Path) -> None:
@@ -200,9 +211,10 @@ def _encode_labels(labels: pd.DataFrame, size: tuple[int, int]) -> bytes:
     return buffer.getvalue()
 
 
-def _read_note(archive: Path) -> dict:
+def _read_note(archive: Path, *, alone: bool = False) -> dict:
+    """What is said of an archive, which must be there unless the note is asked for ``alone``."""
     path = archive.with_suffix(".json")
-    for file in (archive, path):
+    for file in (path,) if alone else (archive, path):
         if not file.is_file():
             raise FileNotFoundError(
                 f"{file} does not exist: an archive and its note belong together, are made by `make data-pack` on the "
@@ -217,8 +229,11 @@ def _read_note(archive: Path) -> dict:
 
 
 def _hash(path: Path) -> str:
+    digest = hashlib.sha256()
     with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+        while chunk := file.read(1 << 20):
+            digest.update(chunk)
+    return digest.hexdigest()
 
 
 def _read_quality(quality: int) -> int:
@@ -228,9 +243,9 @@ def _read_quality(quality: int) -> int:
 
 
 def main() -> None:
-    """Pack, unpack or sample both objects of a preset."""
+    """Pack, unpack, describe or sample both objects of a preset."""
     parser = argparse.ArgumentParser(prog="python -m mmgsd.extras.packing", description=__doc__.split("\n")[0])
-    parser.add_argument("action", choices=("pack", "unpack", "sample"))
+    parser.add_argument("action", choices=("pack", "unpack", "describe", "sample"))
     parser.add_argument("preset", nargs="?", default="paper")
     parser.add_argument("--quality", type=int, default=QUALITY, help="of WebP, 1 to 100 (default %(default)s)")
     asked = parser.parse_args()
@@ -241,10 +256,16 @@ def main() -> None:
         if asked.action == "pack":
             note = pack_dataset(folder, archive, quality=asked.quality)
             print(f"{archive}: {note['bytes'] / 1e6:.1f} MB, SHA-256 {note['sha256']}, seed {note['seed']}")
+        elif asked.action == "describe":
+            print(describe_archive(archive, folder))
         elif asked.action == "unpack":
             print(f"{unpack_dataset(archive, folder)}: complete and checked")
         else:
             print(f"{write_sample(folder, paths.root / 'data' / 'sample' / name, quality=asked.quality)}: checked")
+    if asked.action == "sample":
+        from mmgsd.measure.photographs import write_sample_marks  # needs torch, as nothing else here
+
+        print(f"{write_sample_marks(paths.root / 'data' / 'sample')}: their corners and ends")
 
 
 if __name__ == "__main__":

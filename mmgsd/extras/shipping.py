@@ -15,6 +15,7 @@ import torch
 
 from mmgsd.command import run_command
 from mmgsd.config import OBJECTS, Paths, TrainConfig, find_root, load_preset
+from mmgsd.experiments import configure_model
 from mmgsd.files import DamagedFileError, ForeignFileError, locked, set_aside, write_bytes, write_text
 from mmgsd.learn.checkpoints import WEIGHTS, load_metadata, read_config, read_tensors, write_tensors
 from mmgsd.measure.evaluation import read_results
@@ -119,11 +120,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m mmgsd.extras.shipping", description=__doc__.split("\n")[0])
     parser.add_argument("preset", nargs="?", default="paper")
     parser.add_argument("--restore", action="store_true", help="shipped models to where training would leave them")
-    asked = parser.parse_args()
-    config, paths = load_preset(asked.preset), Paths(find_root(), asked.preset)
-    models = {(name, method): config.method(name, method) for name in OBJECTS for method in SHIPPED}
+    args = parser.parse_args()
+    config, paths = load_preset(args.preset), Paths(find_root(), args.preset)
+    models = {(name, method): configure_model(config, name, method) for name in OBJECTS for method in SHIPPED}
     shipped = {key: paths.root / "data" / "weights" / f"{key[0]}{SHIPPED[key[1]]}.safetensors" for key in models}
-    if asked.restore:
+    if args.restore:
         for key, file in shipped.items():
             if file.is_file():
                 print(restore_model(file, paths.model(models[key]), models[key]))
@@ -135,7 +136,7 @@ def main() -> None:
         if not weights.is_file() or method not in results.get(name, {}):
             print(f"{name} {method}: not trained and evaluated yet")
             continue
-        facts = {"preset": asked.preset, "data_seed": config.render[name].seed, **results[name][method]}
+        facts = {"preset": args.preset, "data_seed": config.render[name].seed, **results[name][method]}
         print(ship_model(weights, shipped[name, method], facts))
 
 

@@ -22,7 +22,7 @@ from mmgsd.figures.style import (
     mark_pixel,
     styled,
 )
-from mmgsd.match.matcher import Match
+from mmgsd.match.match import Match
 
 FEW_PAIRS = 5  # of images: their mean says as much of them as of their states
 TRUE = "#00FF6A"  # the sign of true matches
@@ -41,15 +41,15 @@ def describe_queries(queries: pd.DataFrame, data: Dataset) -> pd.DataFrame:
     ``state0``, ``state1`` of source and target; ``seen_target``, the visible share of the target's points; ``border``,
     material points from the source point to the object's border or end; ``covered``, to the nearest hidden point.
     """
-    asked = queries[queries.visible].copy()
+    table = queries[queries.visible].copy()
     states = data.labels.state.to_numpy()
-    asked["state0"], asked["state1"] = states[asked.image0], states[asked.image1]
-    asked["seen_target"] = data.visible.mean(1)[asked.image1]
+    table["state0"], table["state1"] = states[table.image0], states[table.image1]
+    table["seen_target"] = data.visible.mean(1)[table.image1]
     shape = (25, 25) if data.object == "cloth" else (data.n_points,)
     inside = np.pad(np.ones(shape, np.uint8), 1)
     border = distance_transform_cdt(inside, "chessboard")[(slice(1, -1),) * len(shape)].ravel() - 1
     covered = np.stack([_measure_covered(seen.reshape(shape)) for seen in data.visible])
-    return asked.assign(border=border[asked.point], covered=covered[asked.image0, asked.point])
+    return table.assign(border=border[table.point], covered=covered[table.image0, table.point])
 
 
 def _measure_covered(seen: np.ndarray) -> np.ndarray:

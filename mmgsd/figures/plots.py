@@ -16,11 +16,10 @@ from matplotlib.figure import Figure
 from scipy.ndimage import gaussian_filter1d
 
 from mmgsd.config import N_POINTS
+from mmgsd.experiments import ROWS, get_colour, get_label
 from mmgsd.figures.style import (
     COLUMN_IN,
     MARK,
-    METHOD_COLOURS,
-    METHOD_LABELS,
     PAGE_IN,
     add_legend,
     blend_heatmap,
@@ -35,7 +34,8 @@ from mmgsd.figures.style import (
     show_source,
     styled,
 )
-from mmgsd.match.matcher import Match
+from mmgsd.match.describe import say_presence
+from mmgsd.match.match import Match
 from mmgsd.measure.metrics import BIN_PX, ErrorSummary
 
 _ORBIT_COLOURS = ("#D55E00", "#56B4E9", "#FFE100", "#009E73")
@@ -47,7 +47,9 @@ PAGE_QUERIES, PANEL_PX = 100, 640  # on one page at most; the longer side of an 
 def plot_match(match: Match, index: int = 0) -> Figure:
     """Source image with the pixel of one query, target image with heatmap and modes; the title gives the entropy.
 
-    Each mode has its 1-std ellipse, its marker's area shows its weight. ValueError where ``index`` is not in [0, S).
+    Each mode has its 1-std ellipse, its marker's area shows its weight; of one that is hidden they are dashed. Where
+    the pixel or the target does not show the object the title says so instead, where that is known.
+    ValueError where ``index`` is not in [0, S).
     """
     whole = isinstance(index, int | np.integer) and not isinstance(index, bool)
     if not whole or not 0 <= index < len(match):
@@ -56,7 +58,7 @@ def plot_match(match: Match, index: int = 0) -> Figure:
     show_source(axes[0, 0], match, index)
     show_answer(axes[0, 1], match, index)
     axes[0, 0].set_title("Source")
-    axes[0, 1].set_title(f"Matches · entropy {match.entropy[index]:.1f} nats")
+    axes[0, 1].set_title(say_presence(match, index) or f"Matches · entropy {match.entropy[index]:.1f} nats")
     return figure
 
 
@@ -68,7 +70,7 @@ def plot_page(match: Match) -> Figure:
     """
     if not 1 <= len(match) <= PAGE_QUERIES:
         raise ValueError(f"match must hold 1 to {PAGE_QUERIES} queries to be drawn, got {len(match)}")
-    small = _shrink(match)
+    small = shrink_match(match)
     aspect = max(image.shape[0] / image.shape[1] for image in (match.image0, match.image1))
     columns = 4 if len(match) > 1 else 2
     figure, axes = make_grid([aspect] * -(-2 * len(match) // columns), columns, PAGE_IN)
@@ -79,11 +81,12 @@ def plot_page(match: Match) -> Figure:
         show_answer(answer, small, index)
         x, y = match.xy[index]
         source.set_title(f"{index + 1} · pixel {x:g}, {y:g}")
-        answer.set_title(f"entropy {match.entropy[index]:.1f} nats")
+        said = say_presence(match, index).partition(":")[0]  # a panel has room for a word
+        answer.set_title(said or f"entropy {match.entropy[index]:.1f} nats")
     return figure
 
 
-def _shrink(match: Match) -> Match:
+def shrink_match(match: Match) -> Match:
     """The same answer about images of at most PANEL_PX: what a panel of a page shows, in a page's memory."""
     places = {}
     for name in ("image0", "image1"):
@@ -194,7 +197,7 @@ def plot_spatial_rmse(
     maps = [errors["cloth"][method].mean_px.reshape(25, 25) for method in mapped]
     for axis, method, values in zip(axes[1:], mapped, maps, strict=True):
         image = axis.imshow(values, cmap=colormaps["viridis"].with_extremes(bad="0.85"), vmin=0, vmax=np.nanmax(maps))
-        axis.set(title=f"Cloth · {METHOD_LABELS[method]}", xticks=[0, 12, 24], yticks=[0, 12, 24])
+        axis.set(title=f"Cloth · {get_label(method, short=True)}", xticks=[0, 12, 24], yticks=[0, 12, 24])
     axes[1].set(xlabel="Column of the grid", ylabel="Row of the grid")
     figure.colorbar(image, ax=axes[1:], label="RMSE (px)", shrink=0.8)
     add_legend(figure, axes[:1])
@@ -210,7 +213,7 @@ def plot_sigma_ablation(results: Mapping[str, Mapping[str, Mapping[str, float]]]
     for axis, (name, rows) in zip(axes[0], results.items(), strict=True):
         points = sorted((float(sigma), metrics["rmse_mean"]) for sigma, metrics in rows.items())
         sigma, error = zip(*points, strict=True)
-        axis.plot(sigma, error, "o-", ms=3.5, color=METHOD_COLOURS["mmgsd"])
+        axis.plot(sigma, error, "o-", ms=3.5, color=get_colour("mmgsd"))
         for x, y in points:
             axis.annotate(f"{y:.1f}", (x, y), xytext=(0, 4), textcoords="offset points", ha="center", fontsize=6.5)
         axis.set_xscale("log", base=2)
@@ -233,10 +236,10 @@ def plot_training(logs: Mapping[str, pd.DataFrame], *, columns: int = 4) -> Figu
     figure, axes = plt.subplots(rows, columns, figsize=(PAGE_IN * columns / 4, 1.5 * rows), layout="constrained",
                                 squeeze=False)  # fmt: skip
     for axis, (name, log) in zip(axes.flat, logs.items(), strict=False):
-        colour = METHOD_COLOURS.get(name.split()[-1], "0.3")
+        colour = get_colour(name.split()[-1])
         axis.plot(log.step, log.loss, color=colour, alpha=0.3, lw=0.6)
         axis.plot(log.step, log.loss.rolling(max(1, len(log) // 10), min_periods=1).mean(), color=colour)
-        title = " ".join(METHOD_LABELS.get(word, word.capitalize()) for word in name.split())
+        title = " ".join(get_label(word, short=True) if word in ROWS else word.capitalize() for word in name.split())
         axis.set(title=f"{title} · {log.seconds.iloc[-1] / 60:.1f} min", xlabel="Step")
     for axis in axes[:, 0]:
         axis.set_ylabel("Loss")

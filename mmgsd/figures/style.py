@@ -1,7 +1,7 @@
-"""What the figures share: colours and names of the methods, style, panels that show images, and saving.
+"""What the figures share: style, lines of the methods, panels that show images, and saving.
 
 Sizes are those of a two-column paper (3.5 and 7.1 in), colours those of Okabe and Ito, which colour-blind readers tell
-apart; one method has one colour in every figure.
+apart; one method has one colour in every figure (`mmgsd.experiments`).
 """
 
 from __future__ import annotations
@@ -20,31 +20,17 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from mmgsd.config import N_POINTS
+from mmgsd.experiments import get_colour, get_label
 from mmgsd.files import writing
-from mmgsd.match.matcher import Match
+from mmgsd.match.describe import find_hidden, say_presence
+from mmgsd.match.match import Match
 
-METHOD_LABELS = {
-    "mmgsd": "MMGSD", "spcl": "SPCL", "pcl": "PCL", "unimodal": "Unimodal", "spcl_dense": "SPCL, dense",
-    "mmgsd_plain": "MMGSD, plain", "mmgsd_deep": "MMGSD, deeper", "spcl_deep": "SPCL, deeper",
-    "spcl_reference": "SPCL, reference",
-    "mmgsd_long": "MMGSD, longer", "mmgsd_fine": "MMGSD, finer", "mmgsd_fine_deep": "MMGSD, finest",
-    "mmgsd_muon": "MMGSD, Muon",
-    "sift": "SIFT", "orb": "ORB",
-    "surf": "SURF", "akaze": "AKAZE", "daisy": "DAISY", "centre": "Object centre", "random": "Random points",
-}  # fmt: skip
-METHOD_COLOURS = {
-    "mmgsd": "#D55E00", "spcl": "#0072B2", "pcl": "#56B4E9", "unimodal": "#009E73", "spcl_dense": "#88CCEE",
-    "mmgsd_plain": "#F0A070", "mmgsd_deep": "#B22222", "spcl_deep": "#4477CC", "spcl_reference": "#001F4D",
-    "mmgsd_long": "#8A3500", "mmgsd_fine": "#4D1D00", "mmgsd_fine_deep": "#260F00",
-    "mmgsd_muon": "#FF3D00",
-    "sift": "#CC79A7", "orb": "#999933",
-    "surf": "#882255", "akaze": "#332288", "daisy": "#E69F00", "centre": "#404040", "random": "#9A9A9A",
-}  # fmt: skip
 CHANCE_STYLES = {"centre": "--", "random": ":"}
 COLUMN_IN, PAGE_IN = 3.5, 7.1  # widths of a column and of a page
 MARK = "#FFE100"  # the asked pixel
 
 HEAT = colormaps["inferno"](np.linspace(0.3, 1, 256))[:, :3].astype(np.float32)  # from cold to hot
+FAINT = 0.35  # opacity of modes where there is no answer
 FADED = 0.75  # brightness of an image under a heatmap
 
 _SANS = ["DejaVu Sans"]  # comes with matplotlib: the same letters everywhere
@@ -97,14 +83,19 @@ def show_answer(axis: Axes, match: Match, index: int, *, modes: bool = True) -> 
 
 
 def draw_modes(axis: Axes, match: Match, index: int) -> None:
-    """Rings at the modes of one query, their area the weight, and the 1-std ellipses."""
-    for (x, y), weight, covariance in zip(match.modes[index], match.weights[index], match.covariances[index],
-                                          strict=True):  # fmt: skip
-        if not np.isfinite(x):
-            continue
-        radii, angle = compute_ellipse(covariance)
-        axis.add_patch(Ellipse((x, y), *(2 * radii), angle=np.degrees(angle), fill=False, ec="white", lw=0.7))
-        axis.scatter(x, y, s=4 + 40 * weight, c="none", edgecolors="#00E0FF", linewidths=0.9)
+    """Rings at the modes of one query, their area the weight, and the 1-std ellipses; of hidden ones dashed.
+
+    Faint where the query has no answer (`say_presence`).
+    """
+    alpha, hidden = FAINT if say_presence(match, index) else 1.0, find_hidden(match, index)
+    for k in np.flatnonzero(np.isfinite(match.modes[index]).all(-1)):
+        radii, angle = compute_ellipse(match.covariances[index, k])
+        stroke = {"linestyle": (0, (2, 1.5)) if hidden[k] else "-", "alpha": alpha}
+        x, y = match.modes[index, k]
+        ellipse = Ellipse((x, y), *(2 * radii), angle=np.degrees(angle), fill=False, ec="white", lw=0.7, **stroke)
+        axis.add_patch(ellipse)
+        size = 4 + 40 * match.weights[index, k]
+        axis.scatter(x, y, s=size, c="none", edgecolors="#00E0FF", linewidths=0.9, **stroke)
 
 
 def compute_ellipse(covariance: np.ndarray) -> tuple[np.ndarray, float]:
@@ -142,7 +133,7 @@ def fade_image(image: np.ndarray) -> np.ndarray:
 
 def get_line_style(method: str) -> dict:
     """Label, colour and stroke of a method's line; chance is broken, MMGSD on top."""
-    style = {"label": METHOD_LABELS.get(method, method), "color": METHOD_COLOURS.get(method, "0.5")}
+    style = {"label": get_label(method, short=True), "color": get_colour(method)}
     return style | {"linestyle": CHANCE_STYLES.get(method, "-"), "zorder": 4 if method == "mmgsd" else 2}
 
 

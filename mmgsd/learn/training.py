@@ -19,7 +19,8 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torch.utils import deterministic
 from tqdm.auto import tqdm
 
-from mmgsd.config import CONTRASTIVE, DETAILED, MATCHES_OF_ONE, PASSES, TrainConfig, read_count, read_flag
+from mmgsd.checks import read_count, read_flag
+from mmgsd.config import CONTRASTIVE, DETAILED, MATCHES_OF_ONE, PASSES, TrainConfig
 from mmgsd.dataset import Dataset, hold_out, join_datasets, load_parts
 from mmgsd.files import DamagedFileError, saying_what_stays, set_aside, write_text
 from mmgsd.learn import distributed
@@ -36,8 +37,6 @@ from mmgsd.learn.checkpoints import (
     write_checkpoint,
     write_tensors,
 )
-from mmgsd.learn.checkpoints import describe_run as describe_run  # what others ask of a training
-from mmgsd.learn.checkpoints import load_metadata as load_metadata
 from mmgsd.learn.network import build_network, find_device, sample_descriptors
 from mmgsd.learn.objective import compute_head_loss, compute_loss
 from mmgsd.learn.optimiser import make_optimisers
@@ -322,10 +321,10 @@ def _make_network(config: TrainConfig, models: Path) -> torch.nn.Module:
     if start and config.network in PASSES:  # of a model of ours; resnet34 has read torchvision's
         trained = load(start, device="cpu")
         for name in ("network", "descriptor_dim", "roles"):
-            theirs, asked = getattr(trained.config, name), getattr(config, name)
-            within = name == "network" and PASSES.get(theirs, math.inf) <= PASSES[asked] and theirs not in DETAILED
-            if theirs != asked and not within:
-                raise ValueError(f"trunk_weights {start!r} has {name} {theirs!r}, the training {asked!r}")
+            theirs, ours = getattr(trained.config, name), getattr(config, name)
+            within = name == "network" and PASSES.get(theirs, math.inf) <= PASSES[ours] and theirs not in DETAILED
+            if theirs != ours and not within:
+                raise ValueError(f"trunk_weights {start!r} has {name} {theirs!r}, the training {ours!r}")
         network.start_from(trained.network)
     return network
 

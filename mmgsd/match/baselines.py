@@ -1,14 +1,17 @@
-"""Hand-made descriptors, SIFT, ORB and others, asked the same dense question as a trained network.
+"""What one would pick instead, asked the same dense question as a trained network: hand-made descriptors, SIFT, ORB and
+others, and dense features of any network by nearest neighbours, such as ImageNet's (as DIFT or DINO are used).
 
 A descriptor is computed at each source pixel and at each cell of a regular grid on the target's object; a softmax over
 their distances is the heatmap from which :mod:`mmgsd.match.matcher` reads the modes. Every window is 60 to 80 px wide,
-several times the spacing of the material points. SIFT, ORB, AKAZE and SURF are turned by the image's own orientation,
+several times the spacing of the material points. SIFT, ORB and AKAZE are turned by the image's own orientation,
 estimated at each pixel as SIFT or ORB do at their keypoints; DAISY has none and stays upright.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import cv2
@@ -18,12 +21,14 @@ import skimage.feature
 import torch
 from torch import Tensor
 
+from mmgsd.checks import check_choice
 from mmgsd.images import check_pixels, check_question
+from mmgsd.match.features import Extractor, extract_imagenet, sample_features
 from mmgsd.match.match import Match
 from mmgsd.match.matcher import make_match
 from mmgsd.match.mixture import check_modes
 
-BASELINES = ("sift", "orb", "akaze", "daisy", "surf")
+BASELINES = ("sift", "orb", "akaze", "daisy", "imagenet")
 BINARY = ("orb", "akaze")  # compared by Hamming distance
 STRIDE_PX = 16  # between the candidates on the object: about a cell of the trained networks
 SHARPNESS = 2.0  # logits fall by this where the squared distance grows by its std over the object
@@ -46,29 +51,31 @@ WINDOWS = {
     "sift": Window(12.8, octave=2),  # std 6.4 = 1.6 * 2**2 px, window 6 sizes
     "orb": Window(62.0, octave=1),  # the 31 px patch at half the resolution
     "akaze": Window(8.0, octave=2, level=8),  # window 10 sizes; the third octave's first of four levels
-    "surf": Window(27.0),  # window 20 scales of size * 1.2 / 9
 }
 
 
-def list_baselines() -> tuple[str, ...]:
-    """The methods that the installed OpenCV has: all, but SURF only where its non-free modules were built."""
-    return BASELINES if _has_surf() else BASELINES[:-1]
+class FeatureMatcher:
+    """Answers as `match.matcher.Matcher` does, by nearest neighbours among dense features that nothing here trained.
 
+    ``extractor`` makes (D, h, w) numbers, NumPy or torch, of an image (H, W, 3) uint8; their grid covers the whole
+    image. What counts is the angle between two places' features. ``modes`` are returned unless a question says others.
+    """
 
-class BaselineMatcher:
-    """Answers as `match.matcher.Matcher` does, from hand-made descriptors; ValueError for a method not at hand."""
-
-    def __init__(self, method: str, *, modes: int = 1) -> None:
-        _check_choice(method)
-        _create_extractor(method)
+    def __init__(self, extractor: Extractor, *, modes: int = 1) -> None:
+        if not callable(extractor):
+            raise ValueError(f"extractor must be a function of an image, got {extractor!r:.80}")
         check_modes(modes)
-        self.method, self.modes = method, modes
+        self.extractor, self.modes = extractor, modes
+
+    def describe(self, image: np.ndarray, xy: np.ndarray) -> np.ndarray:
+        """Descriptors (S, D) at pixels (S, 2); ValueError for an extractor that makes something else."""
+        return sample_features(self.extractor(image), xy, image.shape[1::-1])
 
     def compute_heatmaps(
         self, image0: np.ndarray, image1: np.ndarray, xy: np.ndarray, mask1: np.ndarray
     ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
         """Heatmaps (S, h, w) and the centres (w,), (h,) px of their cells."""
-        heatmap, grid = compute_baseline_heatmap(image0, image1, xy, mask1, method=self.method)
+        heatmap, grid = compute_described_heatmap(image0, image1, xy, mask1, describe=self.describe)
         return torch.from_numpy(heatmap), (torch.from_numpy(grid[0, :, 0]), torch.from_numpy(grid[:, 0, 1]))
 
     def match(
@@ -81,32 +88,55 @@ class BaselineMatcher:
         cells, centres = self.compute_heatmaps(image0, image1, points, mask1)
         return make_match(image0, image1, points, cells, centres, n, fitted=self.modes)
 
+    def match_many(self, questions: Iterable[tuple[Any, Any, Any]], *, n: Any = None) -> Iterator[Match]:
+        """As `Matcher.match_many`."""
+        return (self.match(image0, image1, xy, n=n) for image0, image1, xy in questions)
+
+
+class BaselineMatcher(FeatureMatcher):
+    """The same of a method in `BASELINES`; ValueError for one not at hand."""
+
+    def __init__(self, method: str, *, modes: int = 1) -> None:
+        check_choice("method", method, BASELINES)
+        super().__init__(extract_imagenet, modes=modes)
+        self.method = method
+
+    def describe(self, image: np.ndarray, xy: np.ndarray) -> np.ndarray:
+        """As `compute_descriptors`."""
+        return compute_descriptors(image, xy, method=self.method)
+
 
 def compute_baseline_heatmap(
-    image0: np.ndarray,
-    image1: np.ndarray,
-    xy: np.ndarray,
-    mask1: np.ndarray,
-    *,
-    method: str,
-    stride: int = STRIDE_PX,
+    image0: np.ndarray, image1: np.ndarray, xy: np.ndarray, mask1: np.ndarray, *, method: str, stride: int = STRIDE_PX
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Distribution over a grid on image1's object of where each source pixel of image0 matches, for one baseline.
+    """`compute_described_heatmap` of a method in BASELINES.
 
-    ``image0``, ``image1`` (H, W, 3) uint8 RGB, ``xy`` (S, 2) px in image0, ``mask1`` (H1, W1) bool, ``method`` one of
-    BASELINES. Returns the heatmap (S, h, w) float32, which sums to 1 and is 0 off the object, and the cells' centres
-    (h, w, 2) px: cell (i, j) lies at ``(stride - 1) / 2 + stride * (j, i)``. The heatmap is softmax(-d² / 2τ²) over
-    the object's cells, d the descriptors' L2 or Hamming distance, 2τ² a query's own std of d² divided by SHARPNESS.
-    Raises ValueError for other arguments, a mask without any cell, or ``surf`` in an OpenCV built without it.
+    ValueError for another.
     """
-    _check_choice(method)
+    check_choice("method", method, BASELINES)
+    describe = partial(compute_descriptors, method=method)
+    return compute_described_heatmap(image0, image1, xy, mask1, describe=describe, stride=stride)
+
+
+def compute_described_heatmap(
+    image0: np.ndarray, image1: np.ndarray, xy: np.ndarray, mask1: np.ndarray, *,
+    describe: Callable[[np.ndarray, np.ndarray], np.ndarray], stride: int = STRIDE_PX,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Distribution over a grid on image1's object of where each source pixel of image0 matches.
+
+    ``image0``, ``image1`` (H, W, 3) uint8 RGB, ``xy`` (S, 2) px in image0, ``mask1`` (H1, W1) bool; ``describe`` makes
+    descriptors (S, K) of an image and pixels (S, 2) in it. Returns the heatmap (S, h, w) float32, which sums to 1 and
+    is 0 off the object, and the cells' centres (h, w, 2) px: (i, j) lies at ``(stride - 1) / 2 + stride * (j, i)``.
+    The heatmap is softmax(-d² / 2τ²) over the object's cells, d the descriptors' L2 or Hamming distance, 2τ² a query's
+    own std of d² divided by SHARPNESS. Raises ValueError for other arguments, or a mask without any cell.
+    """
     _check_image("image0", image0)
     _check_image("image1", image1)
     xy = check_pixels(xy, image0.shape[1::-1])
     grid = compute_grid(image1.shape[:2], stride=stride)
     on_object = _sample_mask(mask1, image1, grid)  # (h, w)
-    source = compute_descriptors(image0, xy, method=method)  # (S, K)
-    target = compute_descriptors(image1, grid[on_object], method=method)  # (N, K)
+    source = describe(image0, xy)  # (S, K)
+    target = describe(image1, grid[on_object])  # (N, K)
     heatmap = np.zeros((len(xy), *grid.shape[:2]), np.float32)
     heatmap[:, on_object] = _softmax_distances(compute_distances(source, target))
     return heatmap, grid
@@ -125,9 +155,11 @@ def compute_descriptors(image: np.ndarray, xy: np.ndarray, *, method: str) -> np
 
     Raises ValueError for another image, an unknown method, or one that the installed OpenCV lacks.
     """
-    _check_choice(method)
+    check_choice("method", method, BASELINES)
     _check_image("image", image)
     xy = check_pixels(xy, image.shape[1::-1], image="the image")
+    if method == "imagenet":
+        return sample_features(extract_imagenet(image), xy, image.shape[1::-1])
     grey = np.pad(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), PAD_PX, mode="symmetric")
     if not len(xy):
         return np.zeros((0, 1), np.float32)
@@ -179,16 +211,7 @@ def _describe_keypoints(grey: np.ndarray, xy: np.ndarray, method: str) -> np.nda
     return descriptors.astype(np.float32)
 
 
-def _has_surf() -> bool:
-    return hasattr(getattr(cv2, "xfeatures2d", None), "SURF_create")
-
-
 def _create_extractor(method: str) -> cv2.Feature2D:
-    if method == "surf":
-        if not _has_surf():
-            raise ValueError("method 'surf' needs an OpenCV with its non-free modules, got one without; accepted here: "
-                             + ", ".join(map(repr, BASELINES[:-1])))  # fmt: skip
-        return cv2.xfeatures2d.SURF_create()
     if method == "orb":
         return cv2.ORB_create(scaleFactor=2.0, nlevels=2, edgeThreshold=0)
     return cv2.AKAZE_create() if method == "akaze" else cv2.SIFT_create()
@@ -250,11 +273,6 @@ def _sample_mask(mask: np.ndarray, image: np.ndarray, grid: np.ndarray) -> np.nd
     if not inside.any():
         raise ValueError("mask1 must hold at least one cell of the grid, got none: is the object in the image?")
     return inside
-
-
-def _check_choice(method: str) -> None:
-    if method not in BASELINES:
-        raise ValueError(f"method must be one of {', '.join(map(repr, BASELINES))}, got {method!r}")
 
 
 def _check_image(name: str, image: np.ndarray) -> None:

@@ -75,12 +75,15 @@ class Match:
         By default the radius is 20 px of an image of the size that the model was taught with, `RADIUS_PX` times
         ``scale``: the same place of the picture in few pixels or many. Calibrated where ``calibration`` is known: of
         all modes with 0.7, a match is near 7 in 10, on images like those of the training. Else that of a round
-        Gaussian as wide as the mode, less what the mode's weight lacks of an equal share.
+        Gaussian as wide as the mode, less what the mode's weight lacks of an equal share. Times the probability that
+        the pixel asked about and image1 show the object, where that is known.
         """
         radius = RADIUS_PX if radius_px is None else radius_px / self.scale
         if not radius > 0:
             raise ValueError(f"radius_px must be greater than 0 px, got {radius_px!r}")
-        return self._promise.compute_confidence(radius, self._measured)
+        shown = 1.0 if self.on_object is None else self.on_object[:, None]
+        shown = shown if self.absent is None else shown * (1 - self.absent[:, None])
+        return self._promise.compute_confidence(radius, self._measured) * shown
 
     def radius_px(self, *, level: float = 0.9) -> np.ndarray:
         """(S, n) px of image1: a true match lies within it of each mode with at least probability ``level``.

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import math
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,14 +16,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mmgsd.config import CONTRASTIVE, ROUNDNESS, TrainConfig, find_root
+from mmgsd.config import CONTRASTIVE, ROUNDNESS, TrainConfig, find_shipped
 from mmgsd.images import check_aspect, check_mask, check_pixels, to_rgb
-from mmgsd.images import read_image as read_image
 from mmgsd.learn.heads import Outputs, look_up, weigh_cells
 from mmgsd.learn.losses import compute_squared_distances
 from mmgsd.learn.network import compute_cell_centres, find_device, fit_input_size, sample_descriptors
 from mmgsd.match.calibration import Calibration
-from mmgsd.match.match import Best as Best
 from mmgsd.match.match import Match
 from mmgsd.match.mixture import Mixture, check_count, check_modes, fit_modes, keep_most_probable
 from mmgsd.match.weights import read_weights
@@ -191,13 +192,49 @@ class Matcher:
 
     def prepare(self, image0: Any, image1: Any, *, mask0: Any = None, mask1: Any = None) -> Pair:
         """Describe two images once, to ask about them many times; arguments and errors are those of `match`."""
+        return self._prepare(image0, image1, self.describe, mask0=mask0, mask1=mask1)
+
+    def match_many(self, questions: Iterable[tuple[Any, Any, Any]], *, n: Any = None) -> Iterator[Match]:
+        """The answers to many questions (image0, image1, xy), each when it is asked for, so in little memory.
+
+        An image that comes again soon, by its pixels, is described once: a reference before many frames. ``n`` and
+        errors are those of `match`; after an error there is no further answer.
+        """
+        recent = _Recent(self.describe)
+        for image0, image1, xy in questions:
+            yield self._prepare(image0, image1, recent.describe).match(xy, n=n)
+
+    def _prepare(
+        self, image0: Any, image1: Any, describe: Callable[[list[np.ndarray]], list[Outputs]], *, mask0: Any = None,
+        mask1: Any = None,
+    ) -> Pair:  # fmt: skip
         images = {name: to_rgb(image, name) for name, image in (("image0", image0), ("image1", image1))}
         for name, image in images.items():
             self.compute_input_size(image, name)
         masks = {"mask0": mask0, "mask1": mask1}
         for (name, mask), image in zip(masks.items(), images.values(), strict=True):
             masks[name] = None if mask is None else check_mask(mask, image.shape[:2], name)
-        return Pair(self, *images.values(), tuple(self.describe(list(images.values()))), **masks)
+        return Pair(self, *images.values(), tuple(describe(list(images.values()))), **masks)
+
+
+class _Recent:
+    """What ``describe`` said of the last few images, found again by their pixels: a camera may refill one array."""
+
+    def __init__(self, describe: Callable[[list[np.ndarray]], list[Outputs]], *, kept: int = 8) -> None:
+        self._describe, self._kept, self._said = describe, kept, OrderedDict()
+
+    def describe(self, images: list[np.ndarray]) -> list[Outputs]:
+        """As `Matcher.describe`."""
+        return [self._look_up(image) for image in images]
+
+    def _look_up(self, image: np.ndarray) -> Outputs:
+        key = image.shape, hashlib.blake2b(image).digest()
+        if key not in self._said:
+            self._said[key] = self._describe([image])[0]
+        self._said.move_to_end(key)
+        while len(self._said) > self._kept:
+            self._said.popitem(last=False)
+        return self._said[key]
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,17 +278,22 @@ class Pair:
 
 
 def load(weights: Path | str, *, device: str = "") -> Matcher:
-    """A `Matcher` with the weights of a file, or of a name that ``data/weights`` holds: ``"cloth"``, ``"rope-spcl"``.
+    """A `Matcher` with the weights of a file, or of a name of shipped ones: ``"cloth"``, ``"rope-spcl"``.
 
     FileNotFoundError where there are none; ValueError for a file that is damaged or not ours.
     """
-    if not Path(weights).exists():
-        folder = find_root() / "data" / "weights"
-        names = sorted(path.stem for path in folder.glob("*.safetensors"))
-        if str(weights) not in names:
-            raise FileNotFoundError(f"{weights} must be a safetensors file or one of {', '.join(map(repr, names))}")
-        weights = folder / f"{weights}.safetensors"
-    return Matcher.load(weights, device=device)
+    return Matcher.load(find_weights(weights), device=device)
+
+
+def find_weights(weights: Path | str) -> Path:
+    """The file that `load` reads; FileNotFoundError where there is none."""
+    path = Path(weights)
+    if path.is_file():  # a folder of a model's name does not hide the model
+        return path
+    shipped = {file.stem: file for file in sorted(find_shipped().glob("*.safetensors"), key=lambda file: file.stem)}
+    if str(weights) not in shipped and not path.exists():
+        raise FileNotFoundError(f"{weights} must be a safetensors file or one of {', '.join(map(repr, shipped))}")
+    return shipped.get(str(weights), path)
 
 
 def make_match(

@@ -50,7 +50,7 @@ def read_weights(path: Path | str) -> Weights:
             metadata = file.metadata() or {}
             state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
-        raise ValueError(f"{path} is truncated or no safetensors file ({error}): get it anew") from error
+        raise ValueError(_describe_damage(path, error)) from error
     if metadata.get("format") != FORMAT:
         raise ValueError(f"{path} holds no mmgsd weights: its metadata says format {metadata.get('format')!r}, "
                          f"not {FORMAT!r}")  # fmt: skip
@@ -68,11 +68,17 @@ def _check_file(path: Path) -> None:
         raise ValueError(f"{path} is a folder: give the path of a safetensors file in it")
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist: train a model, or give the path of its weights")
-    with open(path, "rb") as file:  # PermissionError names the file
-        start = file.read(9)  # of safetensors the header's length, which may be any eight bytes, and its brace
-    if start.startswith(PICKLES) and start[8:] != b"{":
-        raise ValueError(f"{path} is a pickle, as PyTorch writes .pt and .pth, or an archive: give the safetensors "
-                         "file that a training of mmgsd wrote")  # fmt: skip
+    open(path, "rb").close()  # PermissionError names the file
+
+
+def _describe_damage(path: Path, error: Exception) -> str:
+    """Why it is no safetensors file; asked only once it is known to be none, for one may begin with the same bytes."""
+    with open(path, "rb") as file:
+        start = file.read(4)
+    if start.startswith(PICKLES):
+        return (f"{path} is a pickle, as PyTorch writes .pt and .pth, or an archive: give the safetensors file that a "
+                "training of mmgsd wrote")  # fmt: skip
+    return f"{path} is truncated or no safetensors file ({error}): get it anew"
 
 
 def _read(path: Path, metadata: dict[str, str], key: str, parse: Any) -> Any:

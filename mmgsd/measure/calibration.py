@@ -15,7 +15,8 @@ import pandas as pd
 import torch
 from scipy.optimize import minimize, minimize_scalar
 
-from mmgsd.config import EvaluateConfig, read_count, read_flag
+from mmgsd.checks import read_count, read_flag
+from mmgsd.config import EvaluateConfig
 from mmgsd.dataset import Dataset, hold_out, join_datasets, load_parts, sample_pairs
 from mmgsd.learn.checkpoints import load_metadata, read_tensors, write_tensors
 from mmgsd.match.calibration import LEVELS, Calibration, Modes, compute_unit, parse_calibration

@@ -11,17 +11,17 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from mmgsd.config import EvaluateConfig, digest, read_count, read_flag
+from mmgsd.checks import read_count, read_flag
+from mmgsd.config import EvaluateConfig, digest
 from mmgsd.dataset import Dataset, load_dataset
 from mmgsd.dataset_format import UNREADABLE
 from mmgsd.files import DamagedFileError, read_json, saying_what_stays, set_aside, write_json, writing
-from mmgsd.match.baselines import BaselineMatcher, list_baselines
+from mmgsd.match.baselines import BASELINES, BaselineMatcher
 from mmgsd.match.matcher import Matcher, check_scales, read_heatmap
 from mmgsd.match.mixture import Mixture, check_modes
 from mmgsd.measure.metrics import aggregate
 from mmgsd.measure.questions import Answer, ask, model_answer
 
-BASELINES = list_baselines()  # hand-made descriptors that this OpenCV has
 CHANCE = ("centre", "random")
 MEASURES = "3"  # to be raised where the same answers are measured in another way
 

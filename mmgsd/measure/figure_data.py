@@ -18,7 +18,8 @@ from safetensors.numpy import save
 from mmgsd.dataset import Dataset
 from mmgsd.figures.plots import compute_object_size
 from mmgsd.files import DamagedFileError, write_bytes
-from mmgsd.match.matcher import Match, Matcher
+from mmgsd.match.match import Match
+from mmgsd.match.matcher import Matcher
 from mmgsd.measure.metrics import ErrorSummary, summarise_errors
 
 QUALITY = 90  # of the example's images, JPEG

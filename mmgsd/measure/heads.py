@@ -12,7 +12,8 @@ import pandas as pd
 import torch
 from tqdm.auto import tqdm
 
-from mmgsd.config import EvaluateConfig, digest, read_flag
+from mmgsd.checks import read_flag
+from mmgsd.config import EvaluateConfig, digest
 from mmgsd.dataset import Dataset, load_dataset
 from mmgsd.files import DamagedFileError, read_json, set_aside, write_json
 from mmgsd.learn.heads import Outputs, look_up

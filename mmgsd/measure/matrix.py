@@ -4,6 +4,7 @@
     python -m mmgsd.measure.matrix paper --only cloth-spcl            those whose name holds that text
     python -m mmgsd.measure.matrix paper --scheduler tcp://host:8786  each worker one model at a time, on its own GPU
     python -m mmgsd.measure.matrix quick --seeds 3                    instead the four methods, each with three seeds
+    python -m mmgsd.measure.matrix paper --study robustness           instead the models of one study
 
 Notebooks find the models and their tables of answers where they would have put them.
 """
@@ -11,15 +12,24 @@ Notebooks find the models and their tables of answers where they would have put 
 from __future__ import annotations
 
 import argparse
-import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from dask.distributed import Client, as_completed
 from tqdm.auto import tqdm
 
+from mmgsd.checks import read_count
 from mmgsd.command import run_command
-from mmgsd.config import METHODS, OBJECTS, OWN_STEPS, Paths, Preset, TrainConfig, find_root, load_preset, read_count
+from mmgsd.config import OBJECTS, Paths, Preset, TrainConfig, find_root, load_preset
+from mmgsd.experiments import (
+    RUN,
+    STUDIES,
+    configure_study,
+    list_rows,
+    list_runs,
+    vary_seed,
+    vary_sigma,
+)
 from mmgsd.files import DamagedFileError
 from mmgsd.learn.checkpoints import WEIGHTS, describe_run
 from mmgsd.learn.training import train_model
@@ -35,35 +45,26 @@ from mmgsd.measure.evaluation import (
 )
 from mmgsd.parameters import read_scheduler
 
-FIRST = ("mmgsd", "spcl")  # before the studies
-LATER = ("unimodal", "pcl", "spcl_dense", "mmgsd_plain", "mmgsd_deep", "spcl_deep")  # and after
-GROUPS = ("c4", "v4", "d4")
 VALIDATIONS = 8  # RMSE on held-out simulations, in a model's log
 
 Task = TrainConfig | tuple[str, str]  # a model to train and ask, or an object and a baseline to ask
 
 
-def list_models(preset: Preset) -> list[TrainConfig]:
-    """MMGSD and SPCL, the studies' models (symmetry, methods, σ), and the rest of the main table."""
-    main, last = {name: preset.main_table(name) for name in OBJECTS}, (*LATER, *OWN_STEPS)
-    first, later = ([main[name][method] for method in methods for name in OBJECTS] for methods in (FIRST, last))
-    budget = [preset.budget_table(name)[m] for m in (*FIRST, *LATER) for name in OBJECTS]
-    groups = [dataclasses.replace(preset.ablation["cloth"], group=group) for group in GROUPS]
-    sigmas = [preset.sigma_table(name)[sigma] for sigma in preset.sigma_table("cloth") for name in OBJECTS]
-    return list(dict.fromkeys([*first, *groups, *budget, *sigmas, *later]))
-
-
 def list_repeats(preset: Preset, seeds: int, *, steps: int = 0) -> list[TrainConfig]:
     """The four methods of the main table, of other ``steps`` than its where they are not 0: all with seed 0, then 1…"""
-    keyed = {object: preset.seed_table(object, range(seeds), steps=steps) for object in OBJECTS}
-    order = METHODS[::-1]  # MMGSD first
-    return [keyed[object][f"{m}-{seed}"] for seed in range(seeds) for m in order for object in OBJECTS]
+    rows = vary_seed(range(seeds))
+    keyed = {object: configure_study(preset, object, "seeds", rows, steps=steps) for object in OBJECTS}
+    models = [keyed[object][row.name] for row in rows for object in OBJECTS]
+    return sorted(models, key=lambda model: model.seed)
 
 
-def list_tasks(preset: Preset) -> list[Task]:
-    """MMGSD and SPCL, then chance and the hand-made descriptors, then the other models (`list_models`)."""
-    models, count = list_models(preset), len(FIRST) * len(OBJECTS)
-    return [*models[:count], *((name, method) for method in (*CHANCE, *BASELINES) for name in OBJECTS), *models[count:]]
+def list_tasks(preset: Preset, studies: Sequence[str] = RUN) -> list[Task]:
+    """The models of some studies (`mmgsd.experiments.list_runs`), the first followed by chance and hand-made ones."""
+    models, first = list_runs(preset, studies), list_runs(preset, studies[:1])
+    if "main" not in studies:
+        return list(models)
+    untrained = [(name, row.name) for kind in ("chance", "hand_made") for row in list_rows(kind) for name in OBJECTS]
+    return [*first, *untrained, *models[len(first) :]]
 
 
 def name_task(task: Task) -> str:
@@ -96,7 +97,7 @@ def run_task(
 def _find_start(task: Task, preset: Preset) -> list[TrainConfig]:
     """The models of the preset that a task starts from, if it does: each from the one before it."""
     start = task.trunk_weights if isinstance(task, TrainConfig) else ""
-    found = [model for model in list_models(preset) if model.name == start]
+    found = [model for model in list_runs(preset, STUDIES) if model.name == start]
     return [*_find_start(found[0], preset), *found] if found else []
 
 
@@ -117,12 +118,14 @@ def run_tasks(tasks: list[Task], preset: Preset, root: Path, *, scheduler: str =
 
 
 def write_tables(preset: Preset, root: Path) -> None:
-    """Write what is trained and asked so far: the main table, that of the equal budget, and that of σ.
+    """Write what is trained and asked so far: the main table, those of the studies at the equal budget, that of σ.
 
     Where the answers are not here, given on another machine, the row that is there is kept if it is of the same model.
     """
     write_main_table(preset, root)
-    _write_study({name: preset.budget_table(name) for name in OBJECTS}, Paths(root, preset.name), "budget")
+    for study in ("budget", "robustness"):
+        models = {name: configure_study(preset, name, study) for name in OBJECTS}
+        _write_study(models, Paths(root, preset.name), study)
     write_sigma_table(preset, root)
 
 
@@ -132,7 +135,7 @@ def write_main_table(preset: Preset, root: Path) -> dict[str, dict[str, dict]]:
     errors, costs = (read_results(paths.results / f"{name}.json", depth=n) for name, n in (("rmse", 2), ("runs", 1)))
     tables, runs = {name: {} for name in OBJECTS}, {}
     for name in OBJECTS:
-        models = preset.main_table(name)
+        models = configure_study(preset, name, "main")
         for method in (*models, *BASELINES, *CHANCE):
             key, stored = f"{name}-{method}", errors.get(name, {}).get(method, {})
             row, run = _find_row(paths, key, models.get(method), stored, costs.get(key, {}))
@@ -151,8 +154,8 @@ def write_sigma_table(preset: Preset, root: Path, sigmas_px: Sequence[float] = (
     steps = read_count("steps", steps)
     paths, study = Paths(root, preset.name), f"sigma_{steps}" if steps else "sigma"
     there = _read_keys(paths.results / f"{study}.json", float)
-    chosen = [*preset.sigmas_px, *sigmas_px, *there]
-    _write_study({name: preset.sigma_table(name, chosen, steps=steps) for name in OBJECTS}, paths, study)
+    rows = vary_sigma([*preset.sigmas_px, *sigmas_px, *there])
+    _write_study({name: configure_study(preset, name, "sigma", rows, steps=steps) for name in OBJECTS}, paths, study)
 
 
 def write_seed_table(preset: Preset, root: Path, seeds: int = 0, *, steps: int = 0) -> None:
@@ -163,8 +166,8 @@ def write_seed_table(preset: Preset, root: Path, seeds: int = 0, *, steps: int =
     seeds, steps = read_count("seeds", seeds), read_count("steps", steps)
     paths, study = Paths(root, preset.name), f"seeds_{steps}" if steps else "seeds"
     there = _read_keys(paths.results / f"{study}.json", lambda key: int(key.rpartition("-")[2]))
-    chosen = [*range(seeds), *there]
-    _write_study({name: preset.seed_table(name, chosen, steps=steps) for name in OBJECTS}, paths, study)
+    rows = vary_seed([*range(seeds), *there])
+    _write_study({name: configure_study(preset, name, "seeds", rows, steps=steps) for name in OBJECTS}, paths, study)
 
 
 def _read_keys(path: Path, convert: Callable[[str], float]) -> list[float]:
@@ -203,23 +206,26 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m mmgsd.measure.matrix", description=__doc__.split("\n")[0])
     parser.add_argument("preset")
     parser.add_argument("--only", default="", help="those whose name holds this text, like cloth or cloth-spcl")
+    parser.add_argument("--study", default="", choices=STUDIES, help="instead the models of one study")
     parser.add_argument("--seeds", type=int, default=0, help="instead the four methods, each with so many seeds")
     parser.add_argument("--steps", type=int, default=0, help="of those (default: the main table's)")
     parser.add_argument("--scheduler", default="", help="address of a Dask scheduler; none: this process")
-    asked = parser.parse_args()
-    if asked.seeds < 0 or asked.steps < 0 or (asked.steps and not asked.seeds):
+    args = parser.parse_args()
+    if args.seeds < 0 or args.steps < 0 or (args.steps and not args.seeds):
         parser.error("--seeds and --steps must be positive, and --steps needs --seeds")
-    preset = load_preset(asked.preset)
-    tasks = list_repeats(preset, asked.seeds, steps=asked.steps) if asked.seeds else list_tasks(preset)
-    tasks = [task for task in tasks if asked.only in name_task(task)]
+    if args.study and args.seeds:
+        parser.error("--study and --seeds are two different lists of models: give one of them")
+    preset, studies = load_preset(args.preset), (args.study,) if args.study else RUN
+    tasks = list_repeats(preset, args.seeds, steps=args.steps) if args.seeds else list_tasks(preset, studies)
+    tasks = [task for task in tasks if args.only in name_task(task)]
     if not tasks:
-        parser.error(f"--only {asked.only!r}: no model or baseline of the preset {preset.name} has a name with that")
-    scheduler = read_scheduler("--scheduler", asked.scheduler)
+        parser.error(f"--only {args.only!r}: no model or baseline of the preset {preset.name} has a name with that")
+    scheduler = read_scheduler("--scheduler", args.scheduler)
     done = run_tasks(tasks, preset, find_root(), scheduler=scheduler)
     for name, rmse in tqdm(done, total=len(tasks), desc="models and baselines"):
         tqdm.write(f"{name}: {rmse:.1f} px")
-        if asked.seeds:
-            write_seed_table(preset, find_root(), asked.seeds, steps=asked.steps)
+        if args.seeds:
+            write_seed_table(preset, find_root(), args.seeds, steps=args.steps)
         else:
             write_tables(preset, find_root())
 

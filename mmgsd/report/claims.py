@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from mmgsd.config import OBJECTS
-from mmgsd.report.tables import PAPER
+from mmgsd.report.results import PAPER
 
 HELD, IN_PART, NOT_HELD, NOT_MEASURED = "held", "held in part", "did not hold", "not measured"
 MARGIN = 0.05  # two errors that differ by less are not told apart: one training each, one seed
@@ -21,7 +21,7 @@ RANKED = 0.3  # rank correlation from which entropy is said to rank the errors
 NATS = 0.05  # entropies that differ by less are not told apart: 5 % of the area
 SPCL = ("spcl", "spcl_dense")  # the paper's, and the one with the dense supervision that MMGSD gets
 PLAIN = ("edge", "interior")  # of a cloth: where the groups differ
-HAND_MADE = ("sift", "surf", "orb")  # that the paper names
+HAND_MADE = ("sift", "surf", "orb")  # that the paper names; SURF is not in the OpenCV that pip installs
 
 
 @dataclass(frozen=True)

@@ -14,17 +14,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from mmgsd.command import run_command
-from mmgsd.config import IMAGE_SIZE, N_POINTS, OBJECTS, Paths, find_root, load_preset
+from mmgsd.config import IMAGE_SIZE, Paths, find_root, load_preset
 from mmgsd.files import write_text
 from mmgsd.report import latex_tables as tables
 from mmgsd.report.claims import list_claims
-from mmgsd.report.tables import read_table, told_where
-
-FILES = ("rmse", "runs", "budget", "sigma", "uncertainty", "symmetry", "broken_symmetry", "errors", "seeds_1000")
-ENDS = 0.1  # of a rope's length at each end, its extremities; the middle is the fifth around its centre
+from mmgsd.report.results import load_results, told_where
 
 Results = Mapping[str, Any]
 
@@ -45,30 +40,6 @@ def write_report(preset: str, root: Path) -> list[Path]:
         with told_where(paths.results / f"{file}.json"):
             texts[name] = make(results[file]) if file in results else tables.NOT_RUN
     return [write_text(root / "paper" / "generated" / f"{name}.tex", f"{text}\n") for name, text in texts.items()]
-
-
-def load_results(folder: Path) -> dict[str, Any]:
-    """{name: content} of the results files that are there, and ``places`` where the figures' data are."""
-    files = {name: folder / f"{name}.json" for name in FILES}
-    results = {name: read_table(path) for name, path in files.items() if path.is_file()}
-    drawn = {name: folder / f"figures_{name}.safetensors" for name in OBJECTS}
-    places = {name: measure_places(path, name) for name, path in drawn.items() if path.is_file()}
-    return results | ({"places": places} if places else {})
-
-
-def measure_places(path: Path, name: str) -> dict[str, float]:
-    """MMGSD's mean error (px) by place on the object: ``corner``, ``edge``, ``interior``, or ``end``, ``middle``."""
-    from mmgsd.figures.symmetry import find_regions
-    from mmgsd.measure.figure_data import load_figure_data  # with torch: only where it is needed
-
-    errors = load_figure_data(path).errors["mmgsd"]
-    if name == "cloth":
-        places = find_regions()
-    else:
-        from_middle = np.abs(np.arange(N_POINTS) / (N_POINTS - 1) - 0.5)
-        places = {"end": from_middle > 0.5 - ENDS, "middle": from_middle < ENDS}
-    mean, asked = np.nan_to_num(errors.mean_px), errors.asked
-    return {place: float(np.average(mean[p], weights=asked[p])) for place, p in places.items() if asked[p].any()}
 
 
 def flatten(tree: Mapping[str, Any] | Sequence[Any], prefix: str = "") -> dict[str, str]:

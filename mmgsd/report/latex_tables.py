@@ -8,7 +8,8 @@ from typing import Any
 
 from mmgsd.config import OBJECTS
 from mmgsd.report.claims import NOT_MEASURED, Claim, get
-from mmgsd.report.tables import LABELS, PAPER
+from mmgsd.report.results import PAPER
+from mmgsd.report.tables import LABELS
 
 NOT_RUN = r"\emph{Not run for this preset.}"
 RULE = r"\midrule"

@@ -5,30 +5,20 @@ from __future__ import annotations
 import argparse
 import re
 import statistics
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
 from mmgsd.command import run_command
-from mmgsd.config import LONGER
-from mmgsd.files import DamagedFileError, read_json, write_text
+from mmgsd.experiments import MODELS, UNTRAINED, get_label
+from mmgsd.files import write_text
+from mmgsd.report.findings import make_claims_table, make_findings
+from mmgsd.report.results import PAPER, load_results, read_table, told_where
 
-REMEDY = "restore it (it may be in git), or run its notebook again"
-
-PAPER = {"cloth": 32.4, "rope": 31.3}  # px, MMGSD's RMSE as the paper reports it
-LABELS = {
-    "mmgsd": "**MMGSD** (ours)", "mmgsd_deep": "MMGSD, deeper network", "mmgsd_long": f"MMGSD, {LONGER} × the steps",
-    "mmgsd_fine": "MMGSD, then larger images", "mmgsd_fine_deep": "MMGSD, then deeper network",
-    "mmgsd_muon": "MMGSD, Muon, detail branch",
-    "mmgsd_plain": "MMGSD, own loss alone",
-    "spcl_deep": "SPCL, dense, deeper network", "spcl_dense": "SPCL, dense supervision", "spcl": "SPCL",
-    "spcl_reference": "SPCL, reference setting",
-    "unimodal": "Unimodal", "pcl": "PCL",
-    "sift": "SIFT", "orb": "ORB", "akaze": "AKAZE", "daisy": "DAISY", "surf": "SURF",
-    "random": "random points", "centre": "object's centre",
-}  # fmt: skip
-GROUPS = {"v4": "`v4`, the flips", "c4": "`c4`, the rotations", "d4": "`d4`, all eight"}
+TABLED = ("main", "robustness", "hand_made", "chance")
+LABELS = {row.name: row.label for row in (*MODELS, *UNTRAINED) if {*row.studies} & {*TABLED}}  # rows in their order
+HEADLINE = ("mmgsd", "mmgsd_long", "mmgsd_fine_deep", "spcl_dense", "spcl", "unimodal", "pcl", "sift", "centre")
+LONGER_ROWS = ("mmgsd", "mmgsd_deep", "mmgsd_long", "mmgsd_fine", "mmgsd_fine_deep", "mmgsd_muon")
 
 Errors = dict[str, dict[str, dict[str, float]]]  # {object: {method, or σ: {metric: value}}}
 
@@ -40,6 +30,45 @@ def make_results_table(results: Errors, *, paper: bool = True) -> str:
         theirs = [f"*{PAPER[object]}* | – | –" for object in PAPER]
         lines.append(f"| *the paper's MMGSD, 3,500 images each* | {' | '.join(theirs)} |")
     return "\n".join(lines)
+
+
+def make_headline(results: Errors) -> str:
+    """`make_results_table` of the rows that the README has room for."""
+    return make_results_table(_keep(results, HEADLINE))
+
+
+def make_presets_table(results: dict[str, Errors]) -> str:
+    """Markdown of MMGSD's RMSE px by preset, from {path of the results file: errors}."""
+    lines = ["| preset | MMGSD's RMSE px: cloth | rope |", "|---|---|---|"]
+    for path, errors in results.items():
+        cells = " | ".join(f"{errors[name]['mmgsd']['rmse_mean']:.0f}" for name in PAPER)
+        lines.append(f"| `{Path(path).parent}` | {cells} |")
+    return "\n".join(lines)
+
+
+def make_longer_table(results: Errors) -> str:
+    """`make_budget_table` of MMGSD alone, as it was trained longer and otherwise."""
+    return make_budget_table(_keep(results, LONGER_ROWS))
+
+
+def _keep(results: Errors, methods: Collection[str]) -> Errors:
+    return {name: {key: row for key, row in rows.items() if key in methods} for name, rows in results.items()}
+
+
+def make_errors_table(results: dict[str, dict[str, float]]) -> str:
+    """Markdown of MMGSD's RMSE px over some of the queries, from {object: {which queries: error}}."""
+    lines = ["| MMGSD's RMSE px | cloth | rope |", "|---|---|---|"]
+    for queries in dict.fromkeys(queries for row in results.values() for queries in row):
+        errors = (results.get(name, {}).get(queries) for name in PAPER)
+        lines.append(f"| {queries} | {' | '.join('–' if error is None else f'{error:.1f}' for error in errors)} |")
+    return "\n".join(lines)
+
+
+def make_places_table(results: dict[str, Any]) -> str:
+    """Markdown of MMGSD's mean error px by place on the object, from what `load_results` measured."""
+    lines = ["| place | RMSE px |", "|---|---|"]
+    return "\n".join(lines + [f"| {name}: {place} | {error:.1f} |"
+                              for name, row in results["places"].items() for place, error in row.items()])  # fmt: skip
 
 
 def make_budget_table(results: Errors) -> str:
@@ -80,7 +109,7 @@ def make_symmetry_table(results: dict[str, dict[str, Any]]) -> str:
     lines = ["| taught and asked | all | corners | edges | interior |", "|---|---|---|---|---|"]
     for group, row in results.items():
         errors = [row["rmse_mean"], *(row["regions"][region]["rmse_px"] for region in ("corner", "edge", "interior"))]
-        lines.append(f"| {GROUPS.get(group, f'`{group}`')} | {' | '.join(f'{error:.1f}' for error in errors)} |")
+        lines.append(f"| {get_label(group)} | {' | '.join(f'{error:.1f}' for error in errors)} |")
     return "\n".join(lines)
 
 
@@ -99,7 +128,7 @@ def _make_lines(first: str, results: Errors, labels: dict[str, str]) -> list[str
     lines = [f"| {first}".rstrip() + f" | {' | '.join(heads)} |", "|---" * 7 + "|"]
     for key, label in labels.items():
         rows = [results.get(object, {}).get(key) for object in PAPER]
-        if any(rows):  # SURF is not in every OpenCV
+        if any(rows):
             cells = [_format_errors(row) if row else "– | – | –" for row in rows]
             lines.append(f"| {label} | {' | '.join(cells)} |")
     return lines
@@ -144,8 +173,8 @@ def update_tables(document: Path, results: Path) -> None:
         if marked["name"] not in TABLES:
             raise ValueError(f"{document} marks a table {marked['name']!r}, accepted are {', '.join(TABLES)}")
         file, make = TABLES[marked["name"]]
-        values = read_table(results / file)
-        with told_where(results / file):
+        with told_where(results / file if isinstance(file, str) else results):
+            values = _read(results, file)
             return marked["begin"] + make(values) + marked["end"]
 
     text, tables = MARKED.subn(fill, document.read_text())
@@ -154,30 +183,28 @@ def update_tables(document: Path, results: Path) -> None:
     write_text(document, text)
 
 
-def read_table(path: Path) -> dict[str, Any]:
-    """The content of a results file; FileNotFoundError, or DamagedFileError where it is no dictionary."""
-    values = read_json(path, remedy=REMEDY)
-    if not isinstance(values, dict):
-        raise DamagedFileError(f"{path} holds no table of results: {REMEDY}")
-    return values
-
-
-@contextmanager
-def told_where(path: Path) -> Iterator[None]:
-    """Name the file in which a number is missing, or is none."""
-    try:
-        yield
-    except (LookupError, TypeError, AttributeError) as error:
-        raise DamagedFileError(f"{path} lacks a number, or has one that is none ({error!r}): {REMEDY}") from error
+def _read(results: Path, file: str | tuple[str, ...]) -> dict[str, Any]:
+    """A results file; all of a preset's, where a folder is named; or {name: content} of several files."""
+    if not isinstance(file, str):
+        return {name: read_table(results / name) for name in file}
+    return load_results(results / file) if (results / file).is_dir() else read_table(results / file)
 
 
 BEGIN, END = "<!-- NAME: made by `make readme` -->", "<!-- end of NAME -->"
 MARKED = re.compile(
     r"(?P<begin><!-- (?P<name>\w+): made by `make readme` -->\n).*?(?P<end>\n<!-- end of (?P=name) -->)", re.DOTALL
 )
-TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
+TABLES: dict[str, tuple[str | tuple[str, ...], Callable[[Any], str]]] = {
+    "presets": (("quick/rmse.json", "paper/rmse.json"), make_presets_table),
+    "findings": ("paper", make_findings),
+    "claims": ("paper", make_claims_table),
+    "headline": ("paper/rmse.json", make_headline),
     "paper": ("paper/rmse.json", make_results_table),
+    "longer": ("paper/rmse.json", make_longer_table),
+    "errors": ("paper/errors.json", make_errors_table),
+    "places": ("paper", make_places_table),
     "budget": ("paper/budget.json", make_budget_table),
+    "robustness": ("paper/robustness.json", make_budget_table),
     "sigma": ("paper/sigma.json", make_sigma_table),
     "sigma_4000": ("paper/sigma_4000.json", make_sigma_table),
     "symmetry": ("paper/symmetry.json", make_symmetry_table),
@@ -186,7 +213,6 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "quick": ("quick/rmse.json", make_results_table),
     "seeds_quick": ("quick/seeds.json", make_seed_table),
     "uncertainty": ("paper/uncertainty.json", make_uncertainty_table),
-    "uncertainty_quick": ("quick/uncertainty.json", make_uncertainty_table),
 }
 
 
@@ -195,9 +221,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m mmgsd.report.tables", description=__doc__)
     parser.add_argument("results", type=Path, help="the folder of results, data/results")
     parser.add_argument("documents", type=Path, nargs="+", help="Markdown files that mark tables")
-    asked = parser.parse_args()
-    for document in asked.documents:
-        update_tables(document, asked.results)
+    args = parser.parse_args()
+    for document in args.documents:
+        update_tables(document, args.results)
 
 
 if __name__ == "__main__":

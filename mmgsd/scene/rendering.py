@@ -27,6 +27,7 @@ from dask.distributed import Client, LocalCluster, as_completed
 from dask.system import cpu_count
 from tqdm.auto import tqdm
 
+from mmgsd.checks import read_count, read_flag
 from mmgsd.config import (
     ADDED,
     DEFAULT_GROUP,
@@ -35,8 +36,6 @@ from mmgsd.config import (
     RenderConfig,
     drop_added,
     find_root,
-    read_count,
-    read_flag,
     to_dict,
 )
 from mmgsd.dataset import load_dataset
@@ -293,9 +292,9 @@ def _is_whole(path: Path, job: dict, claimed: bool) -> bool:
 
 
 def _check_same_config(config: RenderConfig, stored: dict, folder: Path) -> None:
-    asked, stored = _describe(config), drop_added(stored)
-    if stored != asked:
-        there, wanted = ADDED | stored, ADDED | asked
+    wanted, stored = _describe(config), drop_added(stored)
+    if stored != wanted:
+        there, wanted = ADDED | stored, ADDED | wanted
         changed = [f"{k}: {there.get(k)!r} there, {v!r} asked for" for k, v in wanted.items() if there.get(k) != v]
         raise ValueError(f"{folder} holds another data set ({'; '.join(changed)}): use overwrite=True to replace it")
 

@@ -22,7 +22,9 @@ import pandas as pd
 
 from mmgsd.config import METHODS, OBJECTS, Paths, TrainConfig, find_root, load_preset
 from mmgsd.dataset import hold_out, load_dataset
-from mmgsd.learn.training import LOG, load_metadata, train_model
+from mmgsd.experiments import configure_model
+from mmgsd.learn.checkpoints import LOG, load_metadata
+from mmgsd.learn.training import train_model
 from mmgsd.match.matcher import Matcher
 from mmgsd.measure.questions import measure_rmse
 
@@ -79,29 +81,29 @@ def main() -> None:
     budgets.add_argument("--minutes", type=float, nargs="+", default=[3.0, 12.0])
     budgets.add_argument("--steps", type=int, nargs="+", help="budgets in steps instead")
     parser.add_argument("changes", nargs="*", metavar="name=value", help="settings of TrainConfig")
-    asked = parser.parse_args()
-    paths = Paths(find_root(), asked.preset)
-    config = load_preset(asked.preset).method(asked.object, asked.method)
-    config, dataset = dataclasses.replace(config, **parse_changes(asked.changes)), paths.dataset(asked.object)
+    args = parser.parse_args()
+    paths = Paths(find_root(), args.preset)
+    config = configure_model(load_preset(args.preset), args.object, args.method)
+    config, dataset = dataclasses.replace(config, **parse_changes(args.changes)), paths.dataset(args.object)
     held_out = hold_out(load_dataset(dataset, "train"))[1]
     commit = subprocess.run(["git", "describe", "--always", "--dirty"], capture_output=True, text=True).stdout.strip()
     results = []
-    for steps in asked.steps or plan_steps(asked.minutes, measure_pace(config, dataset)):
+    for steps in args.steps or plan_steps(args.minutes, measure_pace(config, dataset)):
         run = dataclasses.replace(config, steps=steps)
         folder, how = paths.generated / "experiments" / run.name, {"progress": sys.stderr.isatty()}
         weights = train_model(run, dataset, folder, validate_every=max(1, steps // 4), **how)
         note, rmse = load_metadata(weights), measure_rmse(Matcher.load(weights), held_out)
         taken = float(note["seconds"]) / 60
         row = {
-            "date": datetime.date.today().isoformat(), "commit": commit, "preset": asked.preset, "object": asked.object,
-            "method": asked.method, "setting": " ".join(asked.changes), "steps": steps, "minutes": f"{taken:.1f}",
+            "date": datetime.date.today().isoformat(), "commit": commit, "preset": args.preset, "object": args.object,
+            "method": args.method, "setting": " ".join(args.changes), "steps": steps, "minutes": f"{taken:.1f}",
             "images_seen": steps * run.batch, "data": note["data"], "rmse_px": f"{rmse:.1f}",
             "hardware": note["hardware"],
         }  # fmt: skip
         record(row, paths.root / "data" / "results" / "experiments.csv")
         results.append(f"{rmse:.1f} px in {taken:.1f} min")
         print(", ".join(f"{name} {value}" for name, value in row.items() if value != ""), flush=True)
-    print(f"{asked.object}: " + ", ".join(results))
+    print(f"{args.object}: " + ", ".join(results))
 
 
 if __name__ == "__main__":

@@ -22,8 +22,8 @@ from sklearn.mixture import GaussianMixture
 
 from mmgsd.config import ROUNDNESS, Paths, find_root, load_preset
 from mmgsd.dataset import load_dataset, sample_pairs
+from mmgsd.learn.checkpoints import WEIGHTS
 from mmgsd.learn.network import compute_cell_centres
-from mmgsd.learn.training import WEIGHTS
 from mmgsd.match.matcher import Matcher, read_heatmap
 from mmgsd.match.mixture import PRIOR_WEIGHT
 from mmgsd.measure.metrics import compute_mode_errors

@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from mmgsd.config import OBJECTS, EvaluateConfig, Paths, find_root, load_preset
+from mmgsd.experiments import configure_model
 from mmgsd.extras.packing import unpack_dataset
-from mmgsd.learn.training import WEIGHTS
+from mmgsd.learn.checkpoints import WEIGHTS
 from mmgsd.measure.evaluation import evaluate_model, load_queries
 
 QUESTIONS = EvaluateConfig(pairs=100, points=125)
@@ -24,7 +25,7 @@ def main() -> None:
     paths, trained = Paths(find_root(), preset), Paths(find_root(), models)
     for name in OBJECTS:
         archive = paths.root / "data" / "packs" / f"{preset}-{name}.zip"
-        weights = trained.model(load_preset(models).method(name, "mmgsd")) / WEIGHTS
+        weights = trained.model(configure_model(load_preset(models), name, "mmgsd")) / WEIGHTS
         errors = []
         with tempfile.TemporaryDirectory() as folder:
             for data in (paths.dataset(name), unpack_dataset(archive, Path(folder) / name)):

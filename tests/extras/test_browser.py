@@ -29,6 +29,7 @@ STAND_IN = """async ([script, state]) => {
     traits.pair = load(traits.pair);
     window.sent = [];
     window.kernel = {
+        keep: (name, value) => { traits[name] = value; },
         tell: (message) => heard['msg:custom'](message),
         set: (name, values) => { traits[name] = load(values); heard[`change:${name}`](); },
     };
@@ -73,12 +74,12 @@ def make_answer(pair: int, *xy: tuple[float, float]) -> dict:
 def bare(chromium: Any) -> Any:
     """A page with the explorer, pair 1 of grey 0 seen, no question asked."""
     script = base64.b64encode(Pictures._esm.encode()).decode()
-    style = (ROOT / "mmgsd" / "explorer.css").read_text()
+    style = (ROOT / "mmgsd" / "extras" / "explorer.css").read_text()
     chromium.set_content("<body></body>")
     chromium.add_style_tag(content=style)
     state = {"pair": make_pair(1), "answer": {}, "methods": [["mmgsd", "MMGSD"], ["spcl", HOSTILE]], "method": "mmgsd"}
     colours = base64.b64encode(bytes(768)).decode()
-    chromium.evaluate(STAND_IN, [script, {**state, "heat_colours": {"base64": colours}}])
+    chromium.evaluate(STAND_IN, [script, {**state, "marks": "[]", "heat_colours": {"base64": colours}}])
     chromium.get_by_text("left 1").wait_for()
     return chromium
 
@@ -99,6 +100,32 @@ def look(page: Any, side: int = 1) -> np.ndarray:
     """A picture as (H, W, 3)."""
     shot = page.locator(".mmgsd-picture canvas").nth(side).screenshot()
     return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB")).astype(int)
+
+
+def test_what_is_hidden_or_absent_is_said(bare: Any) -> None:
+    answer = make_answer(1, (40, 50))
+    bare.wait_for_timeout(100)
+    assert bare.locator("th", has_text="seen there").count() == 0
+    (query,) = json.loads(answer["json"])
+    query["modes"][0]["visible"] = 0.2
+    show(bare, "answer", {**answer, "json": json.dumps([{**query, "said": "absent: <b>no object</b>"}])})
+    assert bare.locator("td").last.inner_text() == "hidden, 20 %"
+    assert bare.locator("caption .mmgsd-why").inner_text() == "absent: <b>no object</b>"
+    faint = look(bare)
+    show(bare, "answer", answer)
+    assert bare.locator(".mmgsd-why").count() == 0
+    assert (look(bare) != faint).any()
+
+
+def test_pinned_points_are_saved_as_marks(bare: Any) -> None:
+    bare.get_by_role("button", name="save marks").click()
+    assert "Pin points on the left image first" in bare.locator(".mmgsd-line").inner_text()
+    marks = json.dumps([{"file": "a.jpg", "ends": [[3.0, 4.0]]}])
+    bare.evaluate("marks => window.kernel.keep('marks', marks)", marks)
+    with bare.expect_download() as saved:
+        bare.locator(".mmgsd-explorer").press("k")
+    assert saved.value.suggested_filename == "index.json"
+    assert Path(saved.value.path()).read_text() == marks + "\n"
 
 
 def test_text_from_files_stays_text(bare: Any) -> None:

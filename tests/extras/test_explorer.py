@@ -13,7 +13,6 @@ import pytest
 import torch
 from PIL import Image
 
-from mmgsd.__main__ import describe_answer
 from mmgsd.config import TrainConfig
 from mmgsd.dataset import load_dataset
 from mmgsd.extras.explorer import DISPLAY_PX, MOST_PINS, Explorer, prepare_baseline, show_scene
@@ -23,11 +22,11 @@ from mmgsd.extras.explorer_scenes import (
     decode_image,
     load_matchers,
     load_shipped,
-    make_own_scene,
     make_scenes,
 )
 from mmgsd.learn.network import build_network
 from mmgsd.match.baselines import BaselineMatcher
+from mmgsd.match.describe import describe_answer
 from mmgsd.match.matcher import Matcher
 
 CONFIG = TrainConfig(input_px=64, descriptor_dim=4)
@@ -73,6 +72,21 @@ def test_a_click_is_answered_for_its_pixel(explorer: Explorer) -> None:
     assert json.loads(answer["json"])[0]["xy"] == [240, 200]
     assert len(answer["points"]) == 1 and len(answer["points"][0]["ellipses"]) == 4
     assert len(answer["heat"]) == np.prod(answer["heat_size"]) and max(answer["heat"]) == 255
+
+
+def test_pins_of_every_left_image_are_its_marks(explorer: Explorer) -> None:
+    one = explorer.scene.name0
+    assert tell(explorer, "ask", xy=[240, 200], pin=True) is None
+    assert tell(explorer, "ask", xy=[30, 20]) is None  # is no mark
+    explorer.open_own(0, np.zeros((50, 60, 3), np.uint8), "towel.jpg")
+    for x in (5, 6, 7, 8):
+        assert tell(explorer, "ask", xy=[x, 9.06], pin=True) is None
+    assert json.loads(explorer.pictures.marks) == [
+        {"file": one, "kind": "cloth", "visible_corners_unordered": [[240, 200]]},
+        {"file": "towel.jpg", "kind": "cloth", "corners": [[x, 9.1] for x in (5, 6, 7, 8)]},
+    ]
+    assert tell(explorer, "clear") is None
+    assert [entry["file"] for entry in json.loads(explorer.pictures.marks)] == [one]
 
 
 def test_the_saved_answer_is_what_the_command_prints(explorer: Explorer) -> None:
@@ -246,7 +260,7 @@ def test_images_are_decoded_upright_and_damaged_ones_named(rng: np.random.Genera
 
 def test_a_large_photograph_is_sent_small_and_asked_about_in_its_own_pixels(explorer: Explorer) -> None:
     large = np.tile(np.arange(0, 256, dtype=np.uint8)[:, None, None], (12, 4000, 3))
-    scene = make_own_scene(large, large)
+    scene = Scene(large, large)
     shown = show_scene(scene)
     assert shown["sizes"] == [[4000, 3072]] * 2 and len(shown["image0"]) < 1e6
     small = cv2.imdecode(np.frombuffer(shown["image1"], np.uint8), cv2.IMREAD_COLOR)
@@ -276,7 +290,9 @@ def test_hand_made_descriptors_answer_the_same_for_an_enlarged_image(explorer: E
 
 
 def test_own_images_have_no_truth(explorer: Explorer, rng: np.random.Generator) -> None:
-    scene = make_own_scene(rng.random((40, 60)), rng.integers(0, 255, (50, 30, 4), dtype=np.uint8))
+    black = np.zeros((40, 60, 3), np.uint8)
+    scene = Scene(black, black).replace_image(0, rng.random((40, 60)), "a")
+    scene = scene.replace_image(1, rng.integers(0, 255, (50, 30, 4), dtype=np.uint8), "b")
     assert scene.image0.shape == (40, 60, 3) and scene.image1.shape == (50, 30, 3)
     assert len(scene.find_truth(np.array([5.0, 5.0]))) == 0
     own = Explorer({"mmgsd": explorer.matchers["mmgsd"]}, [scene])
@@ -299,7 +315,7 @@ def test_every_shipped_model_of_the_object_is_offered(name: str) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("clth",), "name must be one of 'cloth', 'rope', got 'clth'"),
+        (("clth",), "name must be one of 'cloth', 'rope' .did you mean 'cloth'.., got 'clth'"),
         (("cloth", "tiny"), "preset must be one of 'sample', .* got 'tiny'"),
         (("cloth", "sample", "a.jpg"), r"own_images must be \[\] or a list of two image files, got 'a.jpg'"),
         (("cloth", "sample", ["a.jpg"]), "own_images must be"),

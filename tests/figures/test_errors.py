@@ -12,7 +12,7 @@ from heatmaps import SIZE
 
 from mmgsd.dataset import Dataset, load_dataset
 from mmgsd.figures.errors import choose_worst, describe_queries, plot_error_analysis, plot_worst, summarise_states
-from mmgsd.match.matcher import Match
+from mmgsd.match.match import Match
 
 
 @pytest.fixture

@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from mmgsd.experiments import get_colour
 from mmgsd.figures import style as drawing
 from mmgsd.figures.uncertainty import CURVE_POINTS, plot_calibration, plot_reliability, plot_risk_coverage
 from mmgsd.measure.uncertainty import LEVELS, compute_coverage
@@ -28,16 +29,16 @@ def get_labels(figure) -> list[str]:
 
 
 def test_risk_coverage_draws_methods_in_order_with_the_oracle():
-    figure = plot_risk_coverage(make_tables("random", "surf", "sift", "mmgsd", "unimodal"))
+    figure = plot_risk_coverage(make_tables("random", "daisy", "sift", "mmgsd", "unimodal"))
     assert [axis.get_title() for axis in figure.axes] == ["Cloth", "Rope"]
-    assert get_labels(figure) == ["MMGSD", "MMGSD, oracle", "Unimodal", "SIFT", "SURF"]
+    assert get_labels(figure) == ["MMGSD", "MMGSD, oracle", "Unimodal", "SIFT", "DAISY"]
     line, oracle, unimodal, *others = figure.axes[0].lines
     assert len(others) == 2
     assert line.get_xdata() == pytest.approx([25, 50, 75, 100])
     assert line.get_ydata() == pytest.approx([16, 14, 12, 10])  # mmgsd has scale 4, least entropy at the largest error
     assert oracle.get_ydata() == pytest.approx([4, 6, 8, 10])
     assert unimodal.get_ydata() == pytest.approx([20, 17.5, 15, 12.5])
-    assert line.get_color() == oracle.get_color() == drawing.METHOD_COLOURS["mmgsd"]
+    assert line.get_color() == oracle.get_color() == get_colour("mmgsd")
     assert line.get_linestyle() == "-" and oracle.get_linestyle() == "--"
     assert figure.get_figwidth() == pytest.approx(drawing.COLUMN_IN)
 
@@ -62,7 +63,7 @@ def test_calibration_draws_coverage_before_and_after():
             distances = np.concatenate(list(tables[name][method].mahalanobis2[:4]))
             assert line.get_xdata() == pytest.approx(100 * np.array(LEVELS))
             assert line.get_ydata() == pytest.approx(100 * compute_coverage(distances))
-            assert line.get_color() == drawing.METHOD_COLOURS[method]
+            assert line.get_color() == get_colour(method)
 
 
 def test_method_without_calibration_keeps_its_name():

@@ -9,9 +9,10 @@ import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 
+from mmgsd.experiments import get_colour
 from mmgsd.figures import plots
 from mmgsd.figures import style as drawing
-from mmgsd.match.matcher import Match
+from mmgsd.match.match import Match
 from mmgsd.measure.metrics import BIN_PX, ErrorSummary, summarise_errors
 
 
@@ -51,6 +52,28 @@ def test_plot_match_leaves_out_absent_modes():
     match = make_match()
     match.modes[0, 1] = np.nan
     assert len(plots.plot_match(match).axes[1].patches) == 1
+
+
+def test_hidden_modes_are_dashed():
+    match = dataclasses.replace(make_match(), visible=np.array([[0.9, 0.2]]))
+    seen, hidden = plots.plot_match(match).axes[1].patches
+    assert seen.get_linestyle() == "-" and hidden.get_linestyle() != "-"
+
+
+@pytest.mark.parametrize(
+    ("known", "said"),
+    [
+        ({"absent": [0.93, 0.2]}, "absent: image1 does not show the object (93% sure)"),
+        ({"on_object": [0.2, 0.7]}, "background: the pixel is not on the object (80% sure)"),
+    ],
+)
+def test_what_has_no_answer_says_so_and_is_faint(known, said):
+    match = dataclasses.replace(make_match(2), **{name: np.array(value) for name, value in known.items()})
+    none, some = (plots.plot_match(match, k).axes[1] for k in (0, 1))
+    assert none.get_title() == said and "entropy" in some.get_title()
+    assert none.patches[0].get_alpha() < 0.5 and some.patches[0].get_alpha() == 1
+    titles = [axis.get_title() for axis in plots.plot_page(match).axes]
+    assert said.startswith(titles[1]) and titles[1] and titles[3] == "entropy 7.2 nats"
 
 
 def test_ellipse_follows_the_covariance():
@@ -139,7 +162,7 @@ def test_plot_rmse_pdf_draws_visible_queries_in_percent():
         assert found == pytest.approx(peaks, abs=BIN_PX)
     assert figure.axes[0].get_xlim()[1] == pytest.approx(80, abs=2 * BIN_PX)  # most of all errors are shown
     assert [line.get_linestyle() for line in figure.axes[0].lines] == ["-", "-", "--"]
-    assert figure.axes[0].lines[0].get_color() == drawing.METHOD_COLOURS["mmgsd"]
+    assert figure.axes[0].lines[0].get_color() == get_colour("mmgsd")
 
 
 @pytest.mark.parametrize("points", [625, 25])
@@ -257,5 +280,6 @@ def test_empty_input_is_an_error(call):
 def test_no_figure_stays_open():
     from matplotlib import pyplot
 
+    before = pyplot.get_fignums()  # of other tests
     plots.plot_sigma_ablation({"cloth": {"1": {"rmse_mean": 1.0}}})
-    assert pyplot.get_fignums() == []
+    assert pyplot.get_fignums() == before

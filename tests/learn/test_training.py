@@ -22,13 +22,10 @@ from mmgsd.config import METHODS, TrainConfig
 from mmgsd.dataset import hold_out, load_dataset
 from mmgsd.files import LockedError, locked
 from mmgsd.learn import training
-from mmgsd.learn.checkpoints import check_enough
+from mmgsd.learn.checkpoints import CHECKPOINT, LOG, WEIGHTS, check_enough, load_metadata
 from mmgsd.learn.objective import compute_loss, compute_sigma
 from mmgsd.learn.training import (
-    CHECKPOINT,
-    LOG,
     compute_learning_rate,
-    load_metadata,
     load_training_images,
     make_batch,
     train_model,
@@ -235,7 +232,7 @@ def test_weights_that_cannot_be_started_from(
 def test_a_killed_run_ends_with_the_same_weights(cloth_dataset: Path, tmp_path: Path, optimiser: str) -> None:
     config = dataclasses.replace(LONGER, optimiser=optimiser)
     train_and_kill(config, cloth_dataset, tmp_path / "killed")
-    assert not (tmp_path / "killed" / training.WEIGHTS).exists()
+    assert not (tmp_path / "killed" / WEIGHTS).exists()
     assert json.loads(load_metadata(tmp_path / "killed" / CHECKPOINT)["numbers"])["step"] == HANG_IN_STEP
     resumed = load_file(train(config, cloth_dataset, tmp_path / "killed"))
     undisturbed = load_file(train(config, cloth_dataset, tmp_path / "undisturbed"))
@@ -310,7 +307,7 @@ def test_noise_tells_no_match_from_a_non_match(
 ) -> None:
     """Else a network learns how the two are sampled, not what they show: the shortest way to a small loss."""
     distances = []
-    monkeypatch.setattr(training.losses, method, lambda *both, margin: distances.append(both) or torch.zeros(()))
+    monkeypatch.setattr("mmgsd.learn.losses." + method, lambda *both, margin: distances.append(both) or torch.zeros(()))
     data = load_dataset(cloth_dataset)
     config = dataclasses.replace(TINY, method=method, queries=256)
     batch = make_batch(load_training_images(data, 64), np.arange(4), config, rng, torch.device("cpu"))

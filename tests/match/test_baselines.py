@@ -1,21 +1,20 @@
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from mmgsd.match.baselines import (
     BASELINES,
     BaselineMatcher,
+    FeatureMatcher,
     compute_baseline_heatmap,
     compute_descriptors,
     compute_distances,
     compute_grid,
     compute_orientations,
-    list_baselines,
 )
 
-HERE = BASELINES[:-1]  # SURF is not in every OpenCV
 SIZE = (240, 200)  # width, height
 STRIDE = 8  # px, finer than the default: the image is small
 CENTRE = np.array([119.5, 99.5])
@@ -50,7 +49,7 @@ def turn(image, xy, degrees):
     return turned, np.c_[xy, np.ones(len(xy))] @ matrix.T
 
 
-@pytest.mark.parametrize("method", HERE)
+@pytest.mark.parametrize("method", BASELINES)
 def test_heatmap_is_a_distribution_on_the_object(method, image, mask, xy):
     half = mask.copy()
     half[:, :100] = False
@@ -63,7 +62,7 @@ def test_heatmap_is_a_distribution_on_the_object(method, image, mask, xy):
     assert not heatmap[:, grid[..., 0] < 99].any()
 
 
-@pytest.mark.parametrize("method", HERE)
+@pytest.mark.parametrize("method", BASELINES)
 def test_an_image_matches_itself(method, image, mask, xy):
     heatmap, grid = compute_baseline_heatmap(image, image, xy, mask, method=method, stride=STRIDE)
     errors = np.linalg.norm(find_top(heatmap, grid) - xy, axis=1)
@@ -99,7 +98,7 @@ def test_orientation_of_a_ramp_is_its_gradient(method, tolerance):
     assert got[0] == pytest.approx(33, abs=tolerance)  # SIFT's bins are 10 degrees wide
 
 
-@pytest.mark.parametrize("method", HERE)
+@pytest.mark.parametrize("method", BASELINES)
 def test_no_point_is_dropped_at_the_border(method, image):
     corners = np.array([[-0.5, -0.5], [239.5, -0.5], [-0.5, 199.5], [239.5, 199.5], [0, 100]])
     descriptors = compute_descriptors(image, corners, method=method)
@@ -108,7 +107,7 @@ def test_no_point_is_dropped_at_the_border(method, image):
     assert np.isfinite(descriptors).all()
 
 
-@pytest.mark.parametrize("method", HERE)
+@pytest.mark.parametrize("method", [m for m in BASELINES if m != "imagenet"])  # a network sees the border
 def test_a_plain_image_gives_a_uniform_heatmap(method, image, mask, xy):
     plain = np.full_like(image, 90)
     heatmap, _ = compute_baseline_heatmap(plain, plain, xy[:3], mask, method=method, stride=STRIDE)
@@ -132,18 +131,6 @@ def test_grid_cells_lie_where_documented():
 def test_no_query_gives_an_empty_heatmap(image, mask):
     heatmap, _ = compute_baseline_heatmap(image, image, np.zeros((0, 2)), mask, method="orb", stride=STRIDE)
     assert heatmap.shape == (0, 25, 30)
-
-
-def test_surf_is_used_where_opencv_has_it(image, mask, xy, monkeypatch):
-    monkeypatch.setattr(cv2, "xfeatures2d", SimpleNamespace(SURF_create=cv2.SIFT_create), raising=False)
-    heatmap, grid = compute_baseline_heatmap(image, image, xy, mask, method="surf", stride=STRIDE)
-    assert np.median(np.linalg.norm(find_top(heatmap, grid) - xy, axis=1)) <= 8
-
-
-def test_surf_is_refused_where_opencv_lacks_it(image, mask, xy, monkeypatch):
-    monkeypatch.delattr(cv2, "xfeatures2d", raising=False)
-    with pytest.raises(ValueError, match="non-free modules.*'sift', 'orb', 'akaze', 'daisy'"):
-        compute_baseline_heatmap(image, image, xy, mask, method="surf", stride=STRIDE)
 
 
 @pytest.mark.parametrize(
@@ -171,7 +158,7 @@ def test_bad_arguments_are_named(change, message, image, mask, xy):
         compute_baseline_heatmap(**arguments, method=method, stride=stride)
 
 
-@pytest.mark.parametrize("method", HERE)
+@pytest.mark.parametrize("method", BASELINES)
 def test_a_baseline_answers_as_a_matcher_does(method, image, mask):
     match = BaselineMatcher(method, modes=4).match(image, image, [(100, 90), (130.5, 110)], mask1=mask)
     assert (match.modes.shape, match.covariances.shape, match.heatmap.shape) == ((2, 4, 2), (2, 4, 2, 2), (2, 200, 240))
@@ -191,8 +178,59 @@ def test_an_unknown_baseline():
         BaselineMatcher("lift")
 
 
-def test_surf_is_listed_where_opencv_has_it(monkeypatch):
-    monkeypatch.delattr(cv2, "xfeatures2d", raising=False)
-    assert list_baselines() == HERE
-    monkeypatch.setattr(cv2, "xfeatures2d", SimpleNamespace(SURF_create=cv2.SIFT_create), raising=False)
-    assert list_baselines() == BASELINES
+def encode_colours(image):
+    """A trivial extractor: what it says of a place is its colour, in cells of 4 px."""
+    small = cv2.resize(image, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
+    return small.transpose(2, 0, 1).astype(np.float32)
+
+
+def paint_patches(*places):
+    """A dark picture with a red patch of 48 px at each place, the last one green."""
+    image = np.full((200, 240, 3), (5, 5, 60), np.uint8)
+    for k, (x, y) in enumerate(places):
+        image[y - 24 : y + 24, x - 24 : x + 24] = (20, 220, 0) if k == len(places) - 1 else (220, 20, 0)
+    return image
+
+
+@pytest.mark.parametrize("kind", ["numpy", "torch", "integers"])
+def test_features_of_ones_own_answer_with_all_matches(kind):
+    convert = {"numpy": lambda x: x, "torch": torch.from_numpy, "integers": lambda x: x.astype(np.uint8)}[kind]
+    matcher = FeatureMatcher(lambda image: convert(encode_colours(image)), modes=2)
+    image0, image1 = paint_patches((60, 60), (180, 140)), paint_patches((40, 150), (190, 50), (110, 100))
+    red, green = matcher.match(image0, image1, [(60, 60), (180, 140)])
+    for place in ((40, 150), (190, 50)):
+        assert np.linalg.norm(red.modes[0] - place, axis=1).min() < 16
+    assert np.linalg.norm(green.modes[0] - (110, 100), axis=1).min() < 16
+    (many,) = matcher.match_many([(image0, image1, (60, 60))])
+    np.testing.assert_array_equal(many.modes, red.modes)
+
+
+def test_features_of_ones_own_are_looked_for_on_the_object():
+    image0, image1 = paint_patches((60, 60), (180, 140)), paint_patches((40, 150), (190, 50), (110, 100))
+    mask = np.zeros(image1.shape[:2], bool)
+    mask[:, 120:] = True
+    match = FeatureMatcher(encode_colours).match(image0, image1, (60, 60), mask1=mask)
+    assert np.linalg.norm(match.modes[0, 0] - (190, 50)) < 16
+    assert not match.cells[0, :, :7].any()
+
+
+@pytest.mark.parametrize(
+    ("features", "message"),
+    [
+        (np.zeros((4, 5)), r"extractor must return numbers \(D, h, w\), got float64 \(4, 5\)"),
+        (np.zeros((1, 3, 4, 5)), r"got float64 \(1, 3, 4, 5\)"),
+        (np.zeros((3, 4, 5), bool), "got bool"),
+        (np.full((3, 4, 5), np.nan), "extractor must return finite numbers"),
+        (np.zeros((0, 4, 5)), "extractor must return finite numbers"),
+        ("features", "extractor must return numbers"),
+        (None, "extractor must return numbers"),
+    ],
+)
+def test_other_features_are_refused(image, features, message):
+    with pytest.raises(ValueError, match=message):
+        FeatureMatcher(lambda _: features).match(image, image, (5, 5))
+
+
+def test_an_extractor_is_a_function():
+    with pytest.raises(ValueError, match="extractor must be a function of an image, got 'dino'"):
+        FeatureMatcher("dino")

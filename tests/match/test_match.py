@@ -134,3 +134,9 @@ def test_the_best_mode_is_one_that_is_seen(rng: np.random.Generator) -> None:
     assert hidden.best().xy.tolist() == [[0, 1]]
     for unable in ({"on_object": np.array([0.2])}, {"absent": np.array([0.9])}):
         assert np.isnan(dataclasses.replace(seen, **unable).best().xy).all()
+
+
+def test_where_nothing_shows_the_object_nothing_is_sure() -> None:
+    match = answer(draw_mixture(CORNERS[:2], 8.0), 2)
+    known = dataclasses.replace(match, on_object=np.array([0.4]), absent=np.array([0.5]))
+    np.testing.assert_allclose(known.confidence(), 0.2 * match.confidence(), rtol=1e-6)

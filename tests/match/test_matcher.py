@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -363,3 +364,50 @@ def test_a_mask_that_cannot_be_is_refused_by_name(
 ) -> None:
     with pytest.raises(ValueError, match=f"{name} {message}"):
         matcher.match(image, image, xy=(5, 5), **{name: mask})
+
+
+def test_many_questions_are_answered_as_each_alone_and_an_image_is_described_once(
+    matcher: Matcher, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reference, *frames = rng.integers(0, 256, (4, 60, 80, 3), dtype=np.uint8)
+    described, describe = [], matcher.describe
+    monkeypatch.setattr(matcher, "describe", lambda images: described.extend(images) or describe(images))
+    answers = list(matcher.match_many(((reference, frame, [(5, 6)]) for frame in frames), n=2))
+    assert len(described) == 4
+    for frame, answer in zip(frames, answers, strict=True):
+        alone = matcher.match(reference, frame, [(5, 6)], n=2)
+        np.testing.assert_allclose(answer.modes, alone.modes, atol=0.5)
+
+
+def test_a_refilled_array_is_another_image(matcher: Matcher, rng: np.random.Generator) -> None:
+    buffer = np.zeros((60, 80, 3), np.uint8)
+
+    def film() -> Iterator[tuple]:
+        for value in (0, 200):
+            buffer[:30] = value
+            yield buffer, buffer, [(5, 6)]
+
+    first, second = matcher.match_many(film())
+    assert not np.array_equal(first.cells, second.cells)
+    assert first.image1.max() == 0 and second.image1.max() == 200
+
+
+def test_many_questions_are_taken_one_by_one(matcher: Matcher, image: np.ndarray) -> None:
+    taken = []
+
+    def ask() -> Iterator[tuple]:
+        for k in range(1000):
+            taken.append(k)
+            yield image, image, [(k % 9, 3)]
+
+    answers = matcher.match_many(ask())
+    assert taken == []
+    next(answers), next(answers)
+    assert taken == [0, 1]
+
+
+def test_no_more_than_the_last_few_images_are_kept() -> None:
+    recent = matching._Recent(lambda images: [int(image[0, 0, 0]) for image in images], kept=3)
+    for value in range(20):
+        recent.describe([np.full((2, 2, 3), value, np.uint8), np.zeros((2, 2, 3), np.uint8)])
+    assert list(recent._said.values()) == [18, 19, 0]

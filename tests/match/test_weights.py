@@ -15,7 +15,6 @@ from safetensors.torch import save_file
 from mmgsd.config import TrainConfig, find_root
 from mmgsd.learn.network import build_network
 from mmgsd.match.matcher import Matcher, load
-from mmgsd.match.weights import _check_file
 
 CONFIG = TrainConfig(input_px=64, descriptor_dim=8)
 
@@ -166,10 +165,11 @@ def test_a_damaged_calibration_is_named(matcher: Matcher, tmp_path: Path, value:
         Matcher.load(path)
 
 
-def test_a_header_of_any_length_is_no_pickle(matcher: Matcher, tmp_path: Path) -> None:
-    lengths = set()
-    for more in range(0, 256, 8):  # the file's first byte is the lowest of its header's length
-        path = save_weights(tmp_path / "w.safetensors", matcher.network, note="x" * more)
-        lengths.add(path.read_bytes()[0])
-        _check_file(path)
-    assert 0x80 in lengths
+def test_a_header_that_begins_as_a_pickle_does_is_no_pickle(matcher: Matcher, tmp_path: Path) -> None:
+    path = tmp_path / "w.safetensors"
+    for spare in range(0, 512, 8):  # the header's length, of whose bytes the first is the file's first
+        save_weights(path, matcher.network, spare="x" * spare)
+        if path.read_bytes()[0] == 0x80:
+            break
+    assert path.read_bytes()[0] == 0x80
+    assert Matcher.load(path, device="cpu").modes == matcher.modes

@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 from dask.distributed import LocalCluster
 
-from mmgsd.config import LONGER_TRAINED, METHODS, OBJECTS, Preset, load_preset
+from mmgsd.config import OBJECTS, Preset, load_preset
+from mmgsd.experiments import configure_model, configure_study, list_rows, list_runs, vary_sigma
 from mmgsd.measure import matrix
 from mmgsd.measure.evaluation import write_results
 from mmgsd.measure.matrix import (
-    list_models,
     list_repeats,
     list_tasks,
     run_tasks,
@@ -27,17 +27,17 @@ SMOKE = load_preset("smoke")
 
 
 def test_the_models_that_matter_most_come_first() -> None:
-    models = list_models(load_preset("paper"))
+    models = list_runs(load_preset("paper"))
     assert [(m.object, m.method) for m in models[:4]] == [
         ("cloth", "mmgsd"), ("rope", "mmgsd"), ("cloth", "spcl"), ("rope", "spcl")
     ]  # fmt: skip
-    assert [m.group for m in models[4:7]] == ["c4", "v4", "d4"]  # the studies, then the rest of the main table
+    assert [m.group for m in models[4:7]] == ["v4", "c4", "d4"]  # the studies, then the rest of the main table
     steps = [m.steps for m in models]
-    assert models[4] == load_preset("paper").budget_table("cloth")["mmgsd"]  # one model, two tables
+    assert models[5] == configure_study(load_preset("paper"), "cloth", "budget")["mmgsd"]  # one model, two tables
     assert max(i for i, m in enumerate(models) if m.sigma_px == 16) == max(i for i, n in enumerate(steps) if n == 1000)
     assert set(steps[4:30]) == {1000} and set(steps[30:42]) == {4000} and len(models) == 52
-    assert steps[42:52] == [3500] * 2 + [12000] * 2 + [3000] * 4 + [12000] * 2
-    assert [m.trunk_weights for m in models[46:50]] == [m.name for m in models[44:48]]  # these are trained before
+    assert steps[42:52] == [12000] * 2 + [3000] * 4 + [12000] * 2 + [3500] * 2
+    assert [m.trunk_weights for m in models[44:48]] == [m.name for m in models[42:46]]  # these are trained before
     assert len({m.name for m in models}) == len(models)
     assert {m.group for m in models if m.object == "cloth"} == {"c4", "v4", "d4"}
     assert sorted({m.sigma_px for m in models}) == [1.0, 2.0, 4.0, 8.0, 16.0]
@@ -50,8 +50,8 @@ def test_seed_after_seed_the_four_methods_are_repeated() -> None:
     preset = load_preset("paper")
     models = list_repeats(preset, 3)
     assert [m.seed for m in models] == [0] * 8 + [1] * 8 + [2] * 8
-    assert models[:8] == [preset.method(name, method) for method in METHODS[::-1] for name in OBJECTS]
-    of_budget = [preset.budget_table(name)[method] for method in METHODS[::-1] for name in OBJECTS]
+    assert models[:8] == [configure_model(preset, name, row.name) for row in list_rows("seeds") for name in OBJECTS]
+    of_budget = [configure_study(preset, name, "budget")[row.name] for row in list_rows("seeds") for name in OBJECTS]
     assert list_repeats(preset, 1, steps=1000) == of_budget
 
 
@@ -88,8 +88,8 @@ def test_how_often_to_train_is_checked(
 def test_baselines_come_before_the_studies() -> None:
     preset = load_preset("paper")
     tasks = list_tasks(preset)
-    assert [task for task in tasks if not isinstance(task, tuple)] == list_models(preset)
-    assert tasks[4:8] == [("cloth", "centre"), ("rope", "centre"), ("cloth", "random"), ("rope", "random")]
+    assert [task for task in tasks if not isinstance(task, tuple)] == list_runs(preset)
+    assert tasks[4:8] == [("cloth", "random"), ("rope", "random"), ("cloth", "centre"), ("rope", "centre")]
     assert {method for _, method in tasks[4:16]} >= {"sift", "orb", "akaze", "daisy"}
 
 
@@ -99,8 +99,9 @@ def test_results_are_written_of_what_is_done(tiny_dataset: Callable[..., Path], 
     preset = dataclasses.replace(preset, train={**preset.train, "cloth": cloth})
     small = dataclasses.replace(preset.ablation["cloth"], steps=1, seed=1)
     preset = dataclasses.replace(preset, ablation={**preset.ablation, "cloth": small})
-    asked_by_hand = preset.sigma_table("cloth", [3])["3"]  # no σ of the preset
-    tasks = [preset.main_table("cloth")["spcl_dense"], ("cloth", "sift"), preset.budget_table("cloth")["pcl"]]
+    asked_by_hand = configure_study(preset, "cloth", "sigma", vary_sigma([3]))["3"]  # no σ of the preset
+    pcl = configure_study(preset, "cloth", "budget")["pcl"]
+    tasks = [configure_model(preset, "cloth", "spcl_dense"), ("cloth", "sift"), pcl]
     (_, rmse), (asked, of_sift), (_, of_pcl), (_, of_sigma) = run_tasks([*tasks, asked_by_hand], preset, tmp_path)
     results = tmp_path / "data" / "results" / "smoke"
     write_results({"cloth": {"3": {}, "5": {"run": {"model": "another"}}}}, results / "sigma.json")
@@ -157,7 +158,7 @@ def make_tiny(tiny_dataset: Callable[..., Path], root: Path) -> Preset:
 
 def test_a_cluster_gives_what_this_process_gives(tiny_dataset: Callable[..., Path], tmp_path: Path) -> None:
     preset, root = make_tiny(tiny_dataset, tmp_path), tmp_path
-    models = [dataclasses.replace(preset.method(name, "mmgsd"), steps=1) for name in ("cloth", "rope")]
+    models = [dataclasses.replace(configure_model(preset, name, "mmgsd"), steps=1) for name in ("cloth", "rope")]
     how = {"n_workers": 1, "threads_per_worker": 1, "processes": False, "dashboard_address": "127.0.0.1:0"}
     with LocalCluster(**how, silence_logs="ERROR") as cluster:
         there = dict(run_tasks(models, preset, root, scheduler=cluster.scheduler_address))
@@ -171,7 +172,8 @@ def test_what_a_model_starts_from_is_trained_before_it(tiny_dataset: Callable[..
     preset = make_tiny(tiny_dataset, tmp_path)
     train = {"cloth": dataclasses.replace(preset.train["cloth"], steps=1, input_px=64), "rope": preset.train["rope"]}
     preset = dataclasses.replace(preset, train=train)
-    longer, finer, deeper = (preset.method("cloth", method) for method in LONGER_TRAINED[:3])
+    table = configure_study(preset, "cloth", "main")
+    longer, finer, deeper = (table[name] for name in ("mmgsd_long", "mmgsd_fine", "mmgsd_fine_deep"))
     models = tmp_path / "data" / "generated" / "smoke" / "models"
     (_, rmse), *_ = run_tasks([deeper], preset, tmp_path)
     assert all((models / model.name / "weights.safetensors").is_file() for model in (longer, finer, deeper))
@@ -179,3 +181,26 @@ def test_what_a_model_starts_from_is_trained_before_it(tiny_dataset: Callable[..
     with LocalCluster(**how, silence_logs="ERROR") as cluster:
         there = dict(run_tasks([longer, finer, deeper], preset, tmp_path, scheduler=cluster.scheduler_address))
     assert there[deeper.name] == rmse
+
+
+@pytest.mark.parametrize(("words", "names"), [
+    ("--study robustness --only cloth", ["mmgsd", "mmgsd_workspace", "mmgsd_clutter", "mmgsd_heads"]),
+    ("--study shipped --only cloth", ["shipped"]),
+])  # fmt: skip
+def test_a_study_can_be_run_alone(words: str, names: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    chosen, paper = [], load_preset("paper")
+    monkeypatch.setattr(matrix, "run_tasks", lambda tasks, *_, **__: chosen.extend(tasks) or iter(()))
+    monkeypatch.setattr("sys.argv", ["matrix", "paper", *words.split()])
+    matrix.main()
+    assert chosen == list(configure_study(paper, "cloth", words.split()[1]).values())
+    assert list(configure_study(paper, "cloth", words.split()[1])) == names
+
+
+@pytest.mark.parametrize("words", ["--study fixes", "--study robustness --seeds 2"])
+def test_a_study_that_is_another_list_is_refused(
+    words: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.setattr("sys.argv", ["matrix", "paper", *words.split()])
+    with pytest.raises(SystemExit):
+        matrix.main()
+    assert "--study" in capsys.readouterr().err

@@ -14,8 +14,9 @@ from mmgsd.measure.figure_data import FigureData
 from mmgsd.measure.metrics import PCK_PX, summarise_errors
 from mmgsd.report import latex_tables as report_tables
 from mmgsd.report.claims import HELD, IN_PART, NOT_HELD, NOT_MEASURED, RULES, get, is_better, judge, list_claims
-from mmgsd.report.latex import FILES, flatten, load_results, make_definitions, measure_places, write_report
+from mmgsd.report.latex import flatten, make_definitions, write_report
 from mmgsd.report.latex_tables import NOT_RUN, TABLES, escape
+from mmgsd.report.results import FILES, load_results, measure_places
 from mmgsd.report.tables import LABELS
 
 ROOT = find_root(Path(__file__).parent)

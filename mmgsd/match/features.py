@@ -1,0 +1,50 @@
+"""Dense features of an image that nothing here trained, and their values at pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from mmgsd.learn.network import IMAGENET_MEAN, IMAGENET_STD, build_trunk, compute_taps, sample_descriptors
+
+Extractor = Callable[[np.ndarray], Any]  # (H, W, 3) uint8 -> (D, h, w)
+LONGEST_PX, MULTIPLE_PX = 640, 32  # of what EfficientNet-Lite0 is given: about the sizes it was made for, and up
+TAP = 2  # of strides 4, 8, 16 and 32 px, that of 16: on the sample it finds the most
+
+
+def sample_features(features: Any, xy: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Features (D, h, w) of an image of ``size`` at its pixels ``xy`` (S, 2), of length 1 each: (S, D) float32.
+
+    ValueError for features of another form, or that are not finite.
+    """
+    values = features.detach().cpu().float().numpy() if isinstance(features, Tensor) else np.asarray(features)
+    if values.ndim != 3 or values.dtype.kind not in "iuf":
+        raise ValueError(f"extractor must return numbers (D, h, w), got {values.dtype} {values.shape}")
+    values = torch.from_numpy(values.astype(np.float32))
+    if 0 in values.shape or not values.isfinite().all():
+        shape = tuple(values.shape)
+        raise ValueError(f"extractor must return finite numbers (D, h, w), got others, or none, in {shape}")
+    places = torch.from_numpy(np.asarray(xy, np.float32))[None]
+    return F.normalize(sample_descriptors(values[None], places, size)[0], dim=-1).numpy()
+
+
+@torch.inference_mode()
+def extract_imagenet(image: np.ndarray) -> Tensor:
+    """Features (D, h, w) of EfficientNet-Lite0 as ImageNet taught it, of an image (H, W, 3) uint8."""
+    scale = min(1, LONGEST_PX / max(image.shape[:2]))
+    size = [max(1, round(side * scale / MULTIPLE_PX)) * MULTIPLE_PX for side in image.shape[1::-1]]
+    x = torch.from_numpy(cv2.resize(image, size, interpolation=cv2.INTER_AREA)).permute(2, 0, 1)[None].float() / 255
+    x = (x - torch.tensor(IMAGENET_MEAN).view(3, 1, 1)) / torch.tensor(IMAGENET_STD).view(3, 1, 1)
+    return compute_taps(_load_trunk(), x)[TAP][0]
+
+
+@cache
+def _load_trunk() -> nn.Module:
+    return build_trunk().eval()

@@ -1,0 +1,59 @@
+"""A preset's results files, read for the documents, and what the paper itself reports."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mmgsd.config import N_POINTS, OBJECTS
+from mmgsd.files import DamagedFileError, read_json
+
+REMEDY = "restore it (it may be in git), or run its notebook again"
+PAPER = {"cloth": 32.4, "rope": 31.3}  # px, MMGSD's RMSE as the paper reports it
+FILES = ("rmse", "runs", "budget", "sigma", "uncertainty", "symmetry", "broken_symmetry", "errors", "seeds_1000")
+ENDS = 0.1  # of a rope's length at each end, its extremities; the middle is the fifth around its centre
+
+
+def read_table(path: Path) -> dict[str, Any]:
+    """The content of a results file; FileNotFoundError, or DamagedFileError where it is no dictionary."""
+    values = read_json(path, remedy=REMEDY)
+    if not isinstance(values, dict):
+        raise DamagedFileError(f"{path} holds no table of results: {REMEDY}")
+    return values
+
+
+@contextmanager
+def told_where(path: Path) -> Iterator[None]:
+    """Name the file, or the folder, in which a number is missing, or is none."""
+    try:
+        yield
+    except (LookupError, TypeError, AttributeError) as error:
+        raise DamagedFileError(f"{path} lacks a number, or has one that is none ({error!r}): {REMEDY}") from error
+
+
+def load_results(folder: Path) -> dict[str, Any]:
+    """{name: content} of the results files that are there, and ``places`` where the figures' data are."""
+    files = {name: folder / f"{name}.json" for name in FILES}
+    results = {name: read_table(path) for name, path in files.items() if path.is_file()}
+    drawn = {name: folder / f"figures_{name}.safetensors" for name in OBJECTS}
+    places = {name: measure_places(path, name) for name, path in drawn.items() if path.is_file()}
+    return results | ({"places": places} if places else {})
+
+
+def measure_places(path: Path, name: str) -> dict[str, float]:
+    """MMGSD's mean error (px) by place on the object: ``corner``, ``edge``, ``interior``, or ``end``, ``middle``."""
+    from mmgsd.figures.symmetry import find_regions
+    from mmgsd.measure.figure_data import load_figure_data  # with torch: only where it is needed
+
+    errors = load_figure_data(path).errors["mmgsd"]
+    if name == "cloth":
+        places = find_regions()
+    else:
+        from_middle = np.abs(np.arange(N_POINTS) / (N_POINTS - 1) - 0.5)
+        places = {"end": from_middle > 0.5 - ENDS, "middle": from_middle < ENDS}
+    mean, asked = np.nan_to_num(errors.mean_px), errors.asked
+    return {place: float(np.average(mean[p], weights=asked[p])) for place, p in places.items() if asked[p].any()}

@@ -1,0 +1,48 @@
+"""Sentences and the table of claims take every number from the results."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+
+import pytest
+
+from mmgsd.report.claims import list_claims
+from mmgsd.report.findings import FINDINGS, REPEATS, make_claims_table, make_findings, sum_minutes, to_markdown
+from mmgsd.report.results import load_results
+
+RESULTS = load_results(Path(__file__).resolve().parents[2] / "data" / "results" / "paper")
+
+
+def test_a_finding_changes_with_its_results() -> None:
+    results = copy.deepcopy(RESULTS)
+    results["rmse"]["cloth"]["mmgsd"]["rmse_mean"] = results["rmse"]["cloth"]["spcl"]["rmse_mean"] / 2
+    lines = make_findings(results).splitlines()
+    assert len(lines) == len(FINDINGS)
+    assert "MMGSD has 50 % and" in lines[0]
+
+
+def test_every_claim_is_a_row_with_what_repeats_it() -> None:
+    claims, rows = list_claims(RESULTS), make_claims_table(RESULTS).splitlines()[2:]
+    assert [claim.key for claim in claims] == list(REPEATS)
+    for claim, row in zip(claims, rows, strict=True):
+        assert f"| **{claim.verdict}** |" in row and REPEATS[claim.key][0] in row
+        assert not set(row) & set("\\~$"), row
+
+
+def test_a_claim_without_results_is_not_measured() -> None:
+    assert "**not measured**" in make_claims_table({})
+
+
+@pytest.mark.parametrize(
+    ("key", "models", "minutes"), [("rmse", ("mmgsd",), "50"), ("ball", (), "–"), ("sigma", (), "7")]
+)
+def test_minutes_are_summed_over_the_runs_that_are_stored(key: str, models: tuple[str, ...], minutes: str) -> None:
+    results = {"runs": {"cloth-mmgsd": {"minutes": 20.2}, "rope-mmgsd": {"minutes": 30.1}},
+               "sigma": {"cloth": {"1": {"run": {"minutes": 7.0}}}}}  # fmt: skip
+    assert sum_minutes(results, key, models) == minutes
+
+
+def test_latex_becomes_markdown() -> None:
+    latex = r"\texttt{v4}: 5~px, 47.7\,\%, $\sigma = 1$, $\pm 45^\circ$, --"
+    assert to_markdown(latex) == "`v4`: 5 px, 47.7 %, σ = 1, ±45°, –"

