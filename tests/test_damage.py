@@ -106,8 +106,12 @@ def use_table_of_answers(folder: Path, damage: Callable[[bytes], bytes], dataset
     out = evaluate_baseline("centre", dataset, ASKED, folder / "centre.parquet", progress=False)
     whole = load_queries(out)
     out.write_bytes(damage(out.read_bytes()))
-    with pytest.warns(UserWarning, match="centre.parquet is damaged, so it is made again") if damage is not flip else (
-        nullcontext()  # it may be in statistics that nobody reads
+    with (
+        pytest.warns(UserWarning, match="centre.parquet is damaged, so it is made again")
+        if damage is not flip
+        else (
+            nullcontext()  # it may be in statistics that nobody reads
+        )
     ):
         evaluate_baseline("centre", dataset, ASKED, out, progress=False)
     pd.testing.assert_frame_equal(load_queries(out), whole)

@@ -144,6 +144,7 @@ def test_damage_is_refused(tiny_dataset: Callable[..., Path], damage: Callable[[
 
 def hide_object(folder: Path, *, mask: bool = False) -> None:
     """Say of the first of the images that it does not show the object; its mask shows it still, if so asked."""
+
     def edit(table: pd.DataFrame) -> pd.DataFrame:
         seen = [v & (i > 0) for i, v in enumerate(table.visible)]
         return table.assign(present=np.arange(len(table)) > 0, visible=seen)

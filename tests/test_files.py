@@ -86,8 +86,9 @@ def test_a_lock_names_the_process_that_holds_it_and_ends_with_it(tmp_path):
             " print('held', flush=True); time.sleep(60)")  # fmt: skip
     other = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
     assert other.stdout.readline() == "held\n"
-    with pytest.raises(files.LockedError, match=rf"set is in use by process {other.pid} on .*, rendering since"), (
-        files.locked(folder, "training")
+    with (
+        pytest.raises(files.LockedError, match=rf"set is in use by process {other.pid} on .*, rendering since"),
+        files.locked(folder, "training"),
     ):
         pass
     other.kill()

@@ -100,9 +100,7 @@ def weigh_cells(said: Outputs, shape: tuple[int, int], mask: Tensor | None = Non
     return cells if mask is not None else cells.clamp(min=ELSEWHERE_WEIGHT)
 
 
-def look_up(
-    mask: np.ndarray | None, logits: Tensor | None, xy: np.ndarray, size: tuple[int, int]
-) -> np.ndarray | None:
+def look_up(mask: np.ndarray | None, logits: Tensor | None, xy: np.ndarray, size: tuple[int, int]) -> np.ndarray | None:
     """How likely the object is seen at pixels ``xy`` (S, 2) of an image of ``size``, (S,) in [0, 1].
 
     By the caller's ``mask`` (H, W) bool or else mask ``logits`` (hm, wm); None without either.

@@ -176,9 +176,7 @@ class Matcher:
         sources = said0.descriptors[None, : self.config.descriptor_dim]
         return sample_descriptors(sources, xy[None].to(self.device).float(), size)
 
-    def match(
-        self, image0: Any, image1: Any, xy: Any, *, n: Any = None, mask0: Any = None, mask1: Any = None
-    ) -> Match:
+    def match(self, image0: Any, image1: Any, xy: Any, *, n: Any = None, mask0: Any = None, mask1: Any = None) -> Match:
         """All matches in ``image1`` of the pixels ``xy`` (S, 2), or of the one pixel (2,), of ``image0``.
 
         Images are of any size and each of its own, and of any kind that `mmgsd.images.to_rgb` takes; they are copied.

@@ -192,5 +192,3 @@ def _find_cells(xy: np.ndarray, size: tuple[int, int], shape: tuple[int, int]) -
         np.floor((xy[..., k] + 0.5) * (shape[1 - k] / size[k])).astype(int).clip(0, shape[1 - k] - 1) for k in (0, 1)
     )
     return row * shape[1] + column
-
-

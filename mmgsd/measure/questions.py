@@ -98,5 +98,3 @@ def measure_mean_error(answer: Answer, matcher: Matcher, data: Dataset, config: 
     """Mean RMSE (px) of the answers to queries with a visible source."""
     queries = ask(answer, data, config, matcher.config.group, False, "")
     return float(queries.rmse_px[queries.visible].mean())
-
-

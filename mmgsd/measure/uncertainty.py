@@ -158,9 +158,7 @@ def compute_confidence_error(
     return float(np.mean(errors))
 
 
-def summarise_uncertainty(
-    queries: pd.DataFrame, *, calibration: Calibration | None = None
-) -> dict[str, float | None]:
+def summarise_uncertainty(queries: pd.DataFrame, *, calibration: Calibration | None = None) -> dict[str, float | None]:
     """Quality of the uncertainties of queries with a visible source; None, JSON's null, for what is undefined.
 
     ``spearman`` of entropy and error; ``aurc`` (px) by entropy, ``aurc_oracle`` by the error itself, ``aurc_random``

@@ -60,9 +60,7 @@ def build_sheet(rng: np.random.Generator, sheet: Sheet) -> DeformedObject:
     return DeformedObject(mesh, points, VISIBILITY_RADIUS, {"state": state, "physics_frames": frames})
 
 
-def hand_over(
-    vertices: np.ndarray, info: dict[str, str | float | int], sheet: Sheet | None = None
-) -> DeformedObject:
+def hand_over(vertices: np.ndarray, info: dict[str, str | float | int], sheet: Sheet | None = None) -> DeformedObject:
     """Add simulated vertices (1369, 3) m of the square or a rectangle to the scene as a smooth cloth on the floor."""
     mesh = _add_rendered(vertices, sheet or square_sheet())
     grid = read_vertices(mesh.data)[_order_row_major(mesh.data)]  # (73, 73, 3)

@@ -127,5 +127,3 @@ def _lay_cloth(rng: np.random.Generator, shader: Shader, pixels: np.ndarray) -> 
     noise = shader.node("TexNoise", {"Vector": place, "Scale": scale, "Detail": 1.0}).outputs[0]
     relief = {"Height": noise, "Strength": rng.uniform(0.3, 1.0), "Distance": rng.uniform(0.3, 1.2) / scale}
     return front, shader.node("Bump", relief).outputs[0]
-
-

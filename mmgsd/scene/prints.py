@@ -51,9 +51,7 @@ def draw_table(rng: np.random.Generator) -> Bytes:
     return vary_paint(rng, TABLES[rng.integers(len(TABLES))], 0.12)
 
 
-def draw_other(
-    rng: np.random.Generator, other: Bytes, *, distance: float = 60.0, draw: Draw = draw_paint
-) -> Bytes:
+def draw_other(rng: np.random.Generator, other: Bytes, *, distance: float = 60.0, draw: Draw = draw_paint) -> Bytes:
     """A colour at least ``distance`` (of 255) away from another, of a bounded number of draws."""
     for _ in range(20):
         colour = draw(rng)

@@ -42,7 +42,7 @@ def test_visible_points_lie_in_the_mask_whatever_covers_the_object(name: str, mo
 def test_without_the_object_nothing_is_visible_and_the_mask_is_empty(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(workspace, "ABSENT", 1.0)
     monkeypatch.setattr(grounds, "KINDS", {"floor": 1.0})
-    absent, = render_views("rope", 1)
+    (absent,) = render_views("rope", 1)
     assert not absent.mask.any() and not absent.visible.any() and absent.info["present"] is False
     assert np.isfinite(absent.xy).all() and absent.image.std() > 1
 
