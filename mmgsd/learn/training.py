@@ -277,7 +277,7 @@ class _Run:
             "data": self.data.fingerprint,
             "images": str(len(self.data)),
             "seconds": f"{self.seconds:.1f}",
-            "hardware": _name_hardware(self.device),
+            "hardware": name_hardware(self.device),
         }
         matcher = self.make_matcher()
         if matcher.bandwidth is not None:
@@ -329,7 +329,8 @@ def _make_network(config: TrainConfig, models: Path) -> torch.nn.Module:
     return network
 
 
-def _name_hardware(device: torch.device) -> str:
+def name_hardware(device: torch.device) -> str:
+    """What results say they were made on."""
     if device.type == "cuda":
         return torch.cuda.get_device_name(device)
     threads, cores = torch.get_num_threads(), os.cpu_count()

@@ -132,13 +132,20 @@ def measure_photographs(
     file = find_weights(weights)
     matcher = Matcher.load(file)
     kind = matcher.object or matcher.config.object
-    photographs, rows = read_photographs(place, kind), []
+    about = {"weights": file.name, "sha256": hashlib.sha256(file.read_bytes()).hexdigest(), "object": kind}
+    return about | measure_answers(matcher, read_photographs(place, kind), progress=progress, seen=seen)
+
+
+def measure_answers(
+    matcher: Any, photographs: list[Photograph], *, progress: bool = True,
+    seen: Callable[[Photograph, Match], None] = lambda *_: None,
+) -> dict[str, Any]:  # fmt: skip
+    """The number of photographs and `summarise_photographs` of the answers of anything with ``match_many``."""
+    rows = []
     for photograph, answer in ask_photographs(matcher, photographs, progress=progress):
         seen(photograph, answer)
         rows.append(score_answer(answer, photograph))
-    about = {"weights": file.name, "sha256": hashlib.sha256(file.read_bytes()).hexdigest(), "object": kind}
-    summary = summarise_photographs(pd.concat(rows, ignore_index=True))
-    return {**about, "photographs": len(photographs), **summary}
+    return {"photographs": len(photographs), **summarise_photographs(pd.concat(rows, ignore_index=True))}
 
 
 def check_name(name: str) -> None:

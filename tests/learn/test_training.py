@@ -130,7 +130,7 @@ def test_a_model_of_another_data_set_is_not_taken_for_this_one(cloth_dataset: Pa
 def test_the_hardware_is_what_was_used_of_it(monkeypatch: pytest.MonkeyPatch, threads: int, said: str) -> None:
     monkeypatch.setattr(training.os, "cpu_count", lambda: 8)
     monkeypatch.setattr(training.torch, "get_num_threads", lambda: threads)
-    assert training._name_hardware(torch.device("cpu")) == said
+    assert training.name_hardware(torch.device("cpu")) == said
 
 
 def test_overwrite_trains_again_to_the_same_weights(cloth_dataset: Path, tmp_path: Path) -> None:

@@ -1,0 +1,144 @@
+"""What shipped weights, and what one would pick instead, do on clean renders, on cluttered ones and on photographs.
+
+    python -m mmgsd.measure.shipped cloth cloth-paper daisy --photographs FOLDER    -> data/results/shipped.json
+
+A row a name: of weights in data/weights, or of a baseline, which is asked about each object with the true masks, and in
+photographs with those that the shipped weights see. The test images of the presets `SETS` have to be rendered. Tables
+of answers are kept, so that a killed call goes on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import statistics
+import time
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mmgsd.command import run_command
+from mmgsd.config import OBJECTS, EvaluateConfig, Paths, find_root, load_preset
+from mmgsd.dataset import load_dataset
+from mmgsd.files import read_json, write_json
+from mmgsd.learn.training import name_hardware
+from mmgsd.match.baselines import BASELINES, BaselineMatcher, FeatureMatcher
+from mmgsd.match.match import Match
+from mmgsd.match.matcher import Matcher, find_weights
+from mmgsd.measure.evaluation import evaluate_baseline, evaluate_model, load_queries, read_results
+from mmgsd.measure.heads import MEASURES as HEADS
+from mmgsd.measure.heads import evaluate_heads
+from mmgsd.measure.metrics import aggregate
+from mmgsd.measure.photographs import measure_answers, measure_photographs, read_photographs
+from mmgsd.measure.uncertainty import get_modes, measure_modes, summarise_uncertainty
+
+SETS = ("paper", "workspace")  # presets whose test images are asked about
+LEVEL = 0.9  # of the radii whose promise is checked
+HEAD_PAIRS = 100  # of images whose modes are judged
+TIMED = 9  # questions, of which the median counts
+RESULTS = "shipped.json"
+
+
+def measure_weights(
+    name: str, root: Path, *, photographs: Path | None = None, progress: bool = True
+) -> dict[str, Any]:  # fmt: skip
+    """The row of shipped weights: a dictionary a set of `SETS`, ``photographs``, ``milliseconds`` of one question.
+
+    Of a set: `mmgsd.measure.metrics.aggregate` over visible sources, `summarise_uncertainty` by the weights' own
+    calibration, ``within_radius``, the share of modes with a true match within `Match.radius_px` (level 0.9), and
+    `measure_heads`.
+    """
+    file = find_weights(name)
+    matcher = Matcher.load(file)
+    row = {"object": matcher.object, "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
+           "calibrated": matcher.calibration is not None}  # fmt: skip
+    for preset in SETS:
+        paths = Paths(root, preset)
+        data, config = paths.dataset(matcher.object), load_preset(preset).evaluate
+        table = evaluate_model(file, data, config, paths.queries(f"shipped-{name}"), progress=progress)
+        heads = evaluate_heads(file, data, EvaluateConfig(pairs=HEAD_PAIRS), paths.queries(f"heads-{name}"),
+                               progress=progress)  # fmt: skip
+        row[preset] = _summarise(table, matcher) | {key: read_json(heads)[key] for key in HEADS}
+    if photographs:
+        row["photographs"] = measure_photographs(file, photographs, progress=progress)
+    return row | _time_question(matcher, root)
+
+
+def _summarise(table: Path, matcher: Matcher) -> dict[str, Any]:
+    queries = load_queries(table)
+    modes, calibration = get_modes(queries), matcher.calibration
+    within = None
+    if calibration is not None:
+        radius = calibration.compute_radius(LEVEL, measure_modes(modes))
+        within = round(float(np.mean(modes.distance_px.to_numpy() <= radius)), 4)
+    return {**aggregate(queries[queries.visible]), **summarise_uncertainty(queries, calibration=calibration),
+            "within_radius": within}  # fmt: skip
+
+
+def _time_question(matcher: Matcher, root: Path) -> dict[str, Any]:
+    """Median time of one question about two images that were not seen before, and what it ran on."""
+    data, seconds = load_dataset(root / "data" / "sample" / matcher.object, "test"), []
+    images = [data.load_image(index) for index in range(2)]
+    for _ in range(TIMED):
+        start = time.perf_counter()
+        matcher.match(*images, [[s / 2 for s in data.size]])
+        seconds.append(time.perf_counter() - start)
+    return {"milliseconds": round(1000 * statistics.median(seconds), 1), "hardware": name_hardware(matcher.device)}
+
+
+class Masked:
+    """A baseline that is told where a segmenter, whatever has ``segment(image)``, sees the object."""
+
+    def __init__(self, baseline: FeatureMatcher, segmenter: Any, *, modes: int) -> None:
+        self.baseline, self.segmenter, self.modes = baseline, segmenter, modes
+
+    def match_many(self, questions: Iterable[tuple[np.ndarray, np.ndarray, Any]]) -> Iterator[Match]:
+        """As `Matcher.match_many`; where no object is seen it may be anywhere."""
+        for image0, image1, xy in questions:
+            mask = self.segmenter.segment(image1) > 0.5
+            yield self.baseline.match(image0, image1, xy, n=self.modes, mask1=mask if mask.any() else None)
+
+
+def measure_baseline(
+    method: str, object: str, root: Path, *, photographs: Path | None = None, progress: bool = True
+) -> dict[str, Any]:
+    """The row of a baseline: `mmgsd.measure.metrics.aggregate` over visible sources of each of `SETS`, photographs."""
+    row: dict[str, Any] = {"object": object}
+    for preset in SETS:
+        paths = Paths(root, preset)
+        out = paths.queries(f"{object}-{method}")
+        queries = load_queries(evaluate_baseline(method, paths.dataset(object), load_preset(preset).evaluate, out,
+                                                 progress=progress))  # fmt: skip
+        row[preset] = aggregate(queries[queries.visible])
+    if photographs:
+        segmenter = Matcher.load(find_weights(object))
+        masked = Masked(BaselineMatcher(method), segmenter, modes=segmenter.modes)
+        row["photographs"] = measure_answers(masked, read_photographs(photographs, object), progress=progress)
+    return row
+
+
+def main() -> None:
+    """Measure some weights and baselines and put their rows into the results."""
+    parser = argparse.ArgumentParser(prog="python -m mmgsd.measure.shipped", description=__doc__.split("\n")[0])
+    parser.add_argument("names", nargs="+", metavar="NAME", help=f"weights in data/weights, or {', '.join(BASELINES)}")
+    parser.add_argument("--photographs", type=Path, metavar="FOLDER", help="marked photographs, with index.json")
+    asked = parser.parse_args()
+    root = find_root()
+    out = root / "data" / "results" / RESULTS
+    for name in asked.names:
+        if name in BASELINES:
+            rows = {f"{o}-{name}": measure_baseline(name, o, root, photographs=asked.photographs) for o in OBJECTS}
+        else:
+            rows = {name: measure_weights(name, root, photographs=asked.photographs)}
+        kept = read_results(out)
+        for key, row in rows.items():  # photographs are not at everybody's hand: a call without them keeps the row's
+            before = kept.get(key, {})
+            same = before.get("sha256") == row.get("sha256")
+            kept[key] = ({"photographs": before["photographs"]} if same and "photographs" in before else {}) | row
+        print(f"{write_json(out, kept)}: {', '.join(rows)}")
+
+
+if __name__ == "__main__":
+    run_command(main)

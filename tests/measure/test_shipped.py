@@ -1,0 +1,79 @@
+"""Rows of the shipped weights: clean and cluttered images, photographs; a row's photographs outlast a call without."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_heads_measured import write_weights
+
+from mmgsd.config import EvaluateConfig, Paths, load_preset
+from mmgsd.measure import shipped
+from mmgsd.measure.shipped import Masked, main, measure_baseline, measure_weights
+
+SAMPLE = Path(__file__).parents[2] / "data" / "sample"
+
+
+@pytest.fixture
+def root(tmp_path: Path, cloth_dataset: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A repository with two tiny sets of cloths, a sample and untrained weights under the name ``mine``."""
+    small = dataclasses.replace(load_preset("paper"), evaluate=EvaluateConfig(pairs=2, points=5))
+    monkeypatch.setattr(shipped, "load_preset", lambda _: small)
+    monkeypatch.setattr(shipped, "OBJECTS", ("cloth",))
+    monkeypatch.setattr(shipped, "TIMED", 1)
+    monkeypatch.setenv("MMGSD_ROOT", str(tmp_path))
+    weights = write_weights(tmp_path)
+    monkeypatch.setattr(shipped, "find_weights", lambda _: weights)
+    for preset in shipped.SETS:
+        shutil.copytree(cloth_dataset, Paths(tmp_path, preset).dataset("cloth"))
+    shutil.copytree(SAMPLE / "cloth", tmp_path / "data" / "sample" / "cloth")
+    return tmp_path
+
+
+def test_weights_are_measured_on_both_sets(root: Path) -> None:
+    row = measure_weights("mine", root, progress=False)
+    assert row["object"] == "cloth" and row["calibrated"] is False and row["milliseconds"] > 0
+    for preset in shipped.SETS:
+        assert 0 < row[preset]["rmse_mean"] < 700 and 0 <= row[preset]["mask_iou"] <= 1
+        assert row[preset]["within_radius"] is None and 0 <= row[preset]["ece"] <= 1
+
+
+def test_baselines_are_measured_on_both_sets(root: Path) -> None:
+    row = measure_baseline("daisy", "cloth", root, progress=False)
+    assert all(0 < row[preset]["rmse_mean"] < 700 for preset in shipped.SETS)
+
+
+def test_photographs_of_a_row_outlast_a_call_without_them(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shipped, "measure_photographs", lambda *_, **__: {"best": 3.0})
+    run = [sys.executable, "mine"]
+    monkeypatch.setattr(sys, "argv", [*run, "--photographs", "somewhere"])
+    main()
+    monkeypatch.setattr(sys, "argv", run)
+    main()
+    rows = json.loads((root / "data" / "results" / "shipped.json").read_text())
+    assert rows["mine"]["photographs"] == {"best": 3.0}
+    rows["mine"]["sha256"] = "of other weights"
+    (root / "data" / "results" / "shipped.json").write_text(json.dumps(rows))
+    main()
+    rows = json.loads((root / "data" / "results" / "shipped.json").read_text())
+    assert "photographs" not in rows["mine"]
+
+
+def test_a_baseline_is_told_where_the_object_is_seen() -> None:
+    class Segmenter:
+        def segment(self, image: np.ndarray) -> np.ndarray:
+            return (image[..., 0] > 0).astype(np.float32)
+
+    class Baseline:
+        def match(self, image0: np.ndarray, image1: np.ndarray, xy: object, *, n: int, mask1: np.ndarray | None):
+            return n, None if mask1 is None else int(mask1.sum())
+
+    dark, light = np.zeros((4, 4, 3), np.uint8), np.zeros((4, 4, 3), np.uint8)
+    light[:2] = 255
+    asked = [(dark, light, [[0, 0]]), (dark, dark, [[0, 0]])]
+    assert list(Masked(Baseline(), Segmenter(), modes=4).match_many(asked)) == [(4, 8), (4, None)]
