@@ -40,7 +40,7 @@ def times(factor: float, *, of: int = 0) -> Rule:
 
 
 ITS_OWN = Rule("the weights of what it starts from", lambda start, _: start.name)
-SHIPPED = Rule("the shipped weights", lambda start, _: start.object)
+PAPER_ONLY = Rule("the shipped weights of the paper's images", lambda start, _: f"{start.object}-paper")
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,8 @@ MODELS = (
           {"network": "lite0x2fine", "optimiser": "muon", "input_px": times(2), "roundness": 0.05}, ("main",),
           "MMGSD, Muon", "#FF3D00"),
     Model("shipped", "MMGSD, shipped: photographs too", "mmgsd_muon",
-          {"trunk_weights": SHIPPED, "heads": True, "clutter": True, "also": "workspace"}, ("main", "shipped"),
+          {"trunk_weights": PAPER_ONLY, "heads": True, "clutter": True, "also": "workspace", "steps": times(0.25),
+           "learning_rate": times(2 / 3), "sigma_start_px": 8.0, "prototype_weight": 0.0}, ("main", "shipped"),
           "MMGSD, shipped", "#A6761D"),
     Model("mmgsd_plain", "MMGSD, own loss alone", "mmgsd", {"prototype_weight": 0.0},
           short="MMGSD, plain", colour="#F0A070"),
