@@ -19,31 +19,42 @@ from mmgsd.experiments import configure_model
 from mmgsd.files import DamagedFileError, ForeignFileError, locked, set_aside, write_bytes, write_text
 from mmgsd.learn.checkpoints import WEIGHTS, load_metadata, read_config, read_tensors, write_tensors
 from mmgsd.measure.evaluation import read_results
-from mmgsd.parameters import check_made
+from mmgsd.measure.shipped import RESULTS, SETS
 
-SHIPPED = {"mmgsd": "", "spcl": "-spcl"}  # method: what its files' names end with
+SHIPPED = {"shipped": "", "mmgsd": "-paper", "spcl": "-spcl"}  # row of `MODELS`: what its files' names end with
 CARD = """# {title}
 
 Descriptors of the method `{method}` for a {object}, symmetry group `{group}`; `mmgsd.load("{name}")`.
 
 | | |
 |---|---|
-| data | preset `{preset}`, {images} training images of {width} x {height} px, seed {data_seed}, fingerprint `{data}` |
+| data | preset {presets}, {images} training images of {width} x {height} px, seed {data_seed}, fingerprint `{data}` |
 | training | {steps} steps of {batch} images at {input_px} px, seed {seed}, {minutes:.0f} minutes on {hardware} |
-| RMSE | {rmse_mean:.1f} px mean, {median:.1f} px median, {queries:,} queries with a visible source |
+{errors}
 | file | {megabytes:.1f} MB, safetensors, weights in half precision |
 
-Known limits: rendered images only, one object wholly in view and seen from above. Matches that are
-hidden in the image are guessed. The weights may have been asked before they were rounded to half precision, which does
-not show in these numbers.
+{limits}
 """
+ERRORS = (
+    "| RMSE, {where} | {rmse_mean:.1f} px mean, {median:.1f} px median, {queries:,} queries with a visible source |"
+)
+NOT_MEASURED = "| RMSE | not measured yet |"
+PHOTOGRAPHS = "| photographs | of {photographs}, {found:.0f} % of the marked places found within 5 % of the size |"
+LIMITS = """\
+Known limits: learnt from rendered images only, of one object wholly in view and seen from above. Matches that are
+hidden in the image are guessed. The weights may have been asked before they were rounded to half precision, which does
+not show in these numbers."""
+CLUTTER_LIMITS = """\
+Known limits: learnt from rendered images only, of one object in each, also among other things and seen obliquely; of
+photographs nothing was learnt. `Match.visible`, `on_object` and `absent` say what is hidden or not there."""
 
 
 def ship_model(weights: Path, out: Path, facts: dict) -> Path:
     """Write ``weights`` in half precision to ``out``, the card beside it; vectors (normalisation) stay as they are.
 
     A file that says the same already is left alone: the order of a safetensors header's entries is not kept.
-    ``facts``: ``preset``, ``data_seed`` and the results ``rmse_mean``, ``median``, ``queries``.
+    ``facts``: ``preset``, ``data_seed``, and ``measured``, {which test images: ``rmse_mean``, ``median``, ``queries``}
+    and under "photographs" `mmgsd.measure.photographs.measure_photographs`.
     DamagedFileError for damaged weights, ForeignFileError where ``out`` or the card's place is another kind of file.
     """
     tensors, note = read_tensors(weights)
@@ -53,13 +64,24 @@ def ship_model(weights: Path, out: Path, facts: dict) -> Path:
     if not out.is_file() or not _holds(out, state, note):
         write_tensors(out, state, note)
     width, height = json.loads(note["size"])
+    presets = " and ".join(f"`{name}`" for name in (facts["preset"], config.also) if name)
     described = {
         **dataclasses.asdict(config), **note, **facts, "name": out.stem, "width": width, "height": height,
-        "title": f"{out.stem}.safetensors", "minutes": float(note["seconds"]) / 60,
-        "megabytes": out.stat().st_size / 1e6,
+        "title": f"{out.stem}.safetensors", "minutes": float(note["seconds"]) / 60, "presets": presets,
+        "megabytes": out.stat().st_size / 1e6, "errors": _describe_errors(facts["measured"]),
+        "limits": CLUTTER_LIMITS if config.clutter else LIMITS,
     }  # fmt: skip
     write_text(out.with_suffix(".md"), CARD.format(**described))
     return out
+
+
+def _describe_errors(measured: dict[str, dict]) -> str:
+    """Rows of the card's table."""
+    lines = [ERRORS.format(where=where, **row) for where, row in measured.items() if where != "photographs"]
+    if photographs := measured.get("photographs"):
+        found = 100 * photographs["found@5%"]
+        lines.append(PHOTOGRAPHS.format(photographs=photographs["photographs"], found=found))
+    return "\n".join(lines) or NOT_MEASURED
 
 
 def _check_replaceable(out: Path) -> None:
@@ -129,15 +151,22 @@ def main() -> None:
             if file.is_file():
                 print(restore_model(file, paths.model(models[key]), models[key]))
         return
-    check_made(paths, "04_evaluate", [paths.results / "rmse.json"])
-    results = read_results(paths.results / "rmse.json", depth=2)
     for (name, method), model in models.items():
-        weights = paths.model(model) / WEIGHTS
-        if not weights.is_file() or method not in results.get(name, {}):
+        weights, measured = paths.model(model) / WEIGHTS, _find_measured(paths, name, method)
+        if not weights.is_file() or not (measured or method == "shipped"):  # these are measured as they are shipped
             print(f"{name} {method}: not trained and evaluated yet")
             continue
-        facts = {"preset": args.preset, "data_seed": config.render[name].seed, **results[name][method]}
+        facts = {"preset": args.preset, "data_seed": config.render[name].seed, "measured": measured}
         print(ship_model(weights, shipped[name, method], facts))
+
+
+def _find_measured(paths: Paths, object: str, method: str) -> dict[str, dict]:
+    """What the results hold of a shipped model, {} where nothing is measured."""
+    if method == "shipped":
+        row = read_results(paths.root / "data" / "results" / RESULTS).get(object, {})
+        return {name: row[name] for name in (*SETS, "photographs") if name in row}
+    row = read_results(paths.results / "rmse.json", depth=2).get(object, {}).get(method)
+    return {paths.preset: row} if row else {}
 
 
 if __name__ == "__main__":
