@@ -155,8 +155,8 @@ def _check_words(path: Path, labels: pd.DataFrame) -> None:
             continue
         pattern = patterns.get(column, WORDS)
         wrong = [v for v in labels[column] if not (isinstance(v, str) and pattern.fullmatch(v))]
-        if column not in patterns:
-            wrong = [value for value in wrong if not _is_missing(value)]
+        if column not in patterns:  # what no thing lies about has none to name
+            wrong = [value for value in wrong if value != "" and not _is_missing(value)]
         if wrong:
             raise DatasetError(f"{path}: {column} must be like {pattern.pattern}, got {_shorten(wrong[0])}: {REMEDY}")
     for column in patterns:

@@ -178,6 +178,12 @@ def test_no_pair_is_of_an_image_without_the_object(rng: np.random.Generator) -> 
         sample_pairs(np.arange(2), 1, rng, present=np.array([True, False]))
 
 
+def test_an_image_need_not_have_things_to_name(tiny_dataset: Callable[..., Path]) -> None:
+    folder = tiny_dataset()
+    edit_labels(folder, lambda labels: labels.assign(things=["", "hand, box", *[""] * (len(labels) - 2)]))
+    assert list(load_dataset(folder, "train").labels.things[:2]) == ["", "hand, box"]
+
+
 @pytest.mark.parametrize("object", ["cloth", "rope"])
 def test_whole_data_set_passes(tiny_dataset: Callable[..., Path], object: str) -> None:
     checked = check_dataset(tiny_dataset(object=object, n_train=4, n_test=2))
