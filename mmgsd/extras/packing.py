@@ -7,7 +7,8 @@ and Croissant metadata for data catalogues.
     python -m mmgsd.extras.packing pack paper       data/generated/paper/cloth -> data/packs/paper-cloth.zip + .json
     python -m mmgsd.extras.packing unpack paper     and back
     python -m mmgsd.extras.packing describe paper   Croissant metadata beside each note, from both
-    python -m mmgsd.extras.packing sample paper     24 images of each object -> data/sample/cloth
+    python -m mmgsd.extras.packing sample paper     24 images of each object -> data/sample/cloth; of any other preset
+                                                    -> data/sample/workspace/cloth
 """
 
 from __future__ import annotations
@@ -251,6 +252,7 @@ def main() -> None:
     asked = parser.parse_args()
     load_preset(asked.preset)
     paths = Paths(find_root(), asked.preset)
+    sample = paths.root / "data" / "sample" / ("" if asked.preset == "paper" else asked.preset)
     for name in OBJECTS:
         folder, archive = paths.dataset(name), paths.root / "data" / "packs" / f"{asked.preset}-{name}.zip"
         if asked.action == "pack":
@@ -261,11 +263,11 @@ def main() -> None:
         elif asked.action == "unpack":
             print(f"{unpack_dataset(archive, folder)}: complete and checked")
         else:
-            print(f"{write_sample(folder, paths.root / 'data' / 'sample' / name, quality=asked.quality)}: checked")
+            print(f"{write_sample(folder, sample / name, quality=asked.quality)}: checked")
     if asked.action == "sample":
         from mmgsd.measure.photographs import write_sample_marks  # needs torch, as nothing else here
 
-        print(f"{write_sample_marks(paths.root / 'data' / 'sample')}: their corners and ends")
+        print(f"{write_sample_marks(sample)}: their corners and ends")
 
 
 if __name__ == "__main__":

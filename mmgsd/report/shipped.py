@@ -1,0 +1,80 @@
+"""Tables and sentences of the shipped weights, on clean and cluttered renders and on photographs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from mmgsd.config import OBJECTS
+from mmgsd.experiments import get_label
+from mmgsd.match.baselines import BASELINES
+
+Rows = Mapping[str, Mapping[str, Any]]  # data/results/shipped.json, {name: what `mmgsd.measure.shipped` found}
+SETS = {"paper": "clean", "workspace": "cluttered"}  # test images: what readers know them as
+SENTENCE = """\
+The photographs are others', {counts}, from the public repositories {sources}; nothing was learnt from them. `found` is
+the share of their marked corners or ends that have a mode nearer than 5 % of the object's size, `spurious` the share of
+the surest modes farther than 10 % from all of them, and `best` the distance of `match.best()` to the nearest. One
+question about two new images takes {slowest:.0f} ms ({hardware})."""
+
+
+def list_names(rows: Rows, object: str) -> list[str]:
+    """The rows of an object: weights for everything, those of the paper's images, then baselines."""
+    order = [object, f"{object}-paper", *(f"{object}-{name}" for name in BASELINES)]
+    return [name for name in order if name in rows]
+
+
+def label_row(name: str) -> str:
+    """What tables and figures call a row: weights by the name that loads them."""
+    kind = name.partition("-")[2]
+    return get_label(kind) if kind in BASELINES else f"`{name}`"
+
+
+def make_pictures_table(rows: Rows) -> str:
+    """Markdown of errors on clean and cluttered renders and of what is found in photographs, a row a model."""
+    heads = ["", *(f"{word}: RMSE px" for word in SETS.values()), "photographs: found", "spurious", "best"]
+    lines = [_join(heads), "|---" * len(heads) + "|"]
+    for object in OBJECTS:
+        for name in list_names(rows, object):
+            errors = [_format(rows[name].get(preset), "rmse_mean", 1, ".1f") for preset in SETS]
+            photographs = rows[name].get("photographs")
+            shares = [_format(photographs, key, 100, ".0f", " %") for key in ("found@5%", "spurious")]
+            lines.append(_join([f"{object}, {label_row(name)}", *errors, *shares,
+                                _format(photographs, "best", 1, ".1f", " %")]))  # fmt: skip
+    return "\n".join(lines)
+
+
+def make_knowledge_table(rows: Rows) -> str:
+    """Markdown of what shipped weights know beside the matches, and of how far they keep what they promise."""
+    measures = {"mask IoU": "mask_iou", "seen": "auroc_visible", "on the object": "auroc_on_object",
+                "absent": "auroc_absent", "ECE of ellipses": "ece", "of confidences": "ece_confidence",
+                "within the 90 % radius": "within_radius"}  # fmt: skip
+    lines = [_join(["", *measures]), "|---" * (len(measures) + 1) + "|"]
+    for object in OBJECTS:
+        for name in (name for name in list_names(rows, object) if "calibrated" in rows[name]):
+            for preset, word in SETS.items():
+                found = rows[name].get(preset)
+                cells = [_format(found, key, 1, ".3f" if "ece" in key else ".2f") for key in measures.values()]
+                lines.append(_join([f"`{name}`, {word}", *cells]))
+    return "\n".join(lines)
+
+
+def make_photographs_sentence(rows: Rows) -> str:
+    """How many photographs of which sources were asked about, and how long a question takes."""
+    counts, sources = [], {}
+    for object in OBJECTS:
+        photographs = rows[object]["photographs"]
+        counts.append(f"{photographs['photographs']} of {object}s")
+        sources |= dict.fromkeys(photographs["sources"])
+    slowest = max(rows[object]["milliseconds"] for object in OBJECTS)
+    hardware = rows[OBJECTS[0]]["hardware"]
+    return SENTENCE.format(counts=" and ".join(counts), sources=", ".join(sources), slowest=slowest, hardware=hardware)
+
+
+def _format(row: Mapping[str, Any] | None, key: str, scale: float, form: str, unit: str = "") -> str:
+    value = None if row is None else row.get(key)
+    return "–" if value is None else format(scale * value, form) + unit
+
+
+def _join(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"

@@ -1,0 +1,40 @@
+"""Tables of the shipped weights: what was not measured is a dash, and the sentence counts the photographs."""
+
+from __future__ import annotations
+
+from mmgsd.report.shipped import list_names, make_knowledge_table, make_photographs_sentence, make_pictures_table
+
+FOUND = {"photographs": 34, "found@5%": 0.512, "spurious": 0.25, "best": 8.04, "sources": {"a/b": {}, "c/d": {}}}
+SET = {"rmse_mean": 21.04, "mask_iou": 0.951, "auroc_visible": 0.9, "auroc_on_object": 0.98, "auroc_absent": None,
+       "ece": 0.0264, "ece_confidence": 0.01, "within_radius": 0.91}  # fmt: skip
+ROWS = {
+    "cloth-daisy": {"paper": {"rmse_mean": 71.25}},
+    "cloth-paper": {"calibrated": False, "paper": {"rmse_mean": 26.1}, "workspace": {"rmse_mean": 88.0}},
+    "cloth": {"calibrated": True, "paper": SET, "workspace": SET, "photographs": FOUND, "milliseconds": 120.4,
+              "hardware": "CPU, 2 cores"},
+    "rope": {"calibrated": True, "photographs": FOUND | {"photographs": 32}, "milliseconds": 140.4,
+             "hardware": "CPU, 2 cores"},
+}  # fmt: skip
+
+
+def test_rows_are_in_the_order_of_interest() -> None:
+    assert list_names(ROWS, "cloth") == ["cloth", "cloth-paper", "cloth-daisy"]
+
+
+def test_what_was_not_measured_is_a_dash() -> None:
+    lines = make_pictures_table(ROWS).splitlines()
+    assert lines[2] == "| cloth, `cloth` | 21.0 | 21.0 | 51 % | 25 % | 8.0 % |"
+    assert lines[3] == "| cloth, `cloth-paper` | 26.1 | 88.0 | – | – | – |"
+    assert lines[4] == "| cloth, DAISY | 71.2 | – | – | – | – |"
+    assert len({line.count("|") for line in lines}) == 1
+
+
+def test_knowledge_is_of_weights_alone() -> None:
+    lines = make_knowledge_table(ROWS).splitlines()
+    assert lines[2] == "| `cloth`, clean | 0.95 | 0.90 | 0.98 | – | 0.026 | 0.010 | 0.91 |"
+    assert not any("daisy" in line.lower() for line in lines)
+
+
+def test_the_sentence_counts_photographs_and_names_their_sources() -> None:
+    said = make_photographs_sentence(ROWS)
+    assert "34 of cloths and 32 of ropes" in said and "a/b, c/d" in said and "140 ms (CPU, 2 cores)" in said
