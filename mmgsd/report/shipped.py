@@ -11,11 +11,11 @@ from mmgsd.match.baselines import BASELINES
 
 Rows = Mapping[str, Mapping[str, Any]]  # data/results/shipped.json, {name: what `mmgsd.measure.shipped` found}
 SETS = {"paper": "clean", "workspace": "cluttered"}  # test images: what readers know them as
-SENTENCE = """\
-The photographs are others', {counts}, from the public repositories {sources}; nothing was learnt from them. `found` is
-the share of their marked corners or ends that have a mode nearer than 5 % of the object's size, `spurious` the share of
-the surest modes farther than 10 % from all of them, and `best` the distance of `match.best()` to the nearest. One
-question about two new images takes {slowest:.0f} ms ({hardware})."""
+SOURCES = """\
+`found`: share of the marked corners or ends of others' photographs with a mode nearer than a twentieth of the object's
+size; `spurious`: of the surest modes, those farther than a tenth from all; `best`: distance of `match.best()` to the
+nearest, in % of the size. The photographs are from {sources}."""
+COUNTS = "Photographs: {counts}. One question about two new images takes {slowest:.0f} ms ({hardware})."
 
 
 def list_names(rows: Rows, object: str) -> list[str]:
@@ -59,16 +59,17 @@ def make_knowledge_table(rows: Rows) -> str:
     return "\n".join(lines)
 
 
-def make_photographs_sentence(rows: Rows) -> str:
-    """How many photographs of which sources were asked about, and how long a question takes."""
-    counts, sources = [], {}
-    for object in OBJECTS:
-        photographs = rows[object]["photographs"]
-        counts.append(f"{photographs['photographs']} of {object}s")
-        sources |= dict.fromkeys(photographs["sources"])
-    slowest = max(rows[object]["milliseconds"] for object in OBJECTS)
-    hardware = rows[OBJECTS[0]]["hardware"]
-    return SENTENCE.format(counts=" and ".join(counts), sources=", ".join(sources), slowest=slowest, hardware=hardware)
+def make_sources_sentence(rows: Rows) -> str:
+    """What is counted in photographs, and which public repositories they are from."""
+    sources = dict.fromkeys(name for object in OBJECTS for name in rows[object]["photographs"]["sources"])
+    return SOURCES.format(sources=", ".join(f"`{name}`" for name in sources))
+
+
+def make_counts_sentence(rows: Rows) -> str:
+    """How many photographs were asked about, and how long a question takes."""
+    counts = " and ".join(f"{rows[object]['photographs']['photographs']} of {object}s" for object in OBJECTS)
+    slowest = max(OBJECTS, key=lambda object: rows[object]["milliseconds"])
+    return COUNTS.format(counts=counts, slowest=rows[slowest]["milliseconds"], hardware=rows[slowest]["hardware"])
 
 
 def _format(row: Mapping[str, Any] | None, key: str, scale: float, form: str, unit: str = "") -> str:

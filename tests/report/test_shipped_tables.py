@@ -1,8 +1,14 @@
-"""Tables of the shipped weights: what was not measured is a dash, and the sentence counts the photographs."""
+"""Tables of the shipped weights: what was not measured is a dash, and sentences count photographs and name their sources."""
 
 from __future__ import annotations
 
-from mmgsd.report.shipped import list_names, make_knowledge_table, make_photographs_sentence, make_pictures_table
+from mmgsd.report.shipped import (
+    list_names,
+    make_counts_sentence,
+    make_knowledge_table,
+    make_pictures_table,
+    make_sources_sentence,
+)
 
 FOUND = {"photographs": 34, "found@5%": 0.512, "spurious": 0.25, "best": 8.04, "sources": {"a/b": {}, "c/d": {}}}
 SET = {"rmse_mean": 21.04, "mask_iou": 0.951, "auroc_visible": 0.9, "auroc_on_object": 0.98, "auroc_absent": None,
@@ -35,6 +41,7 @@ def test_knowledge_is_of_weights_alone() -> None:
     assert not any("daisy" in line.lower() for line in lines)
 
 
-def test_the_sentence_counts_photographs_and_names_their_sources() -> None:
-    said = make_photographs_sentence(ROWS)
-    assert "34 of cloths and 32 of ropes" in said and "a/b, c/d" in said and "140 ms (CPU, 2 cores)" in said
+def test_sentences_name_the_sources_and_count_the_photographs() -> None:
+    assert make_sources_sentence(ROWS).endswith("The photographs are from `a/b`, `c/d`.")
+    said = "Photographs: 34 of cloths and 32 of ropes. One question about two new images takes 140 ms (CPU, 2 cores)."
+    assert make_counts_sentence(ROWS) == said
