@@ -1,4 +1,4 @@
-"""Tables of the shipped weights: what was not measured is a dash, and sentences count photographs and name their sources."""
+"""Tables of the shipped weights: what was not measured is a dash; sentences count photographs and name their sources."""
 
 from __future__ import annotations
 
