@@ -1,4 +1,4 @@
-"""Tables of the shipped weights: what was not measured is a dash; sentences count photographs and name their sources."""
+"""Tables of the shipped weights: what was not measured is a dash, photographs are counted, their sources named."""
 
 from __future__ import annotations
 
