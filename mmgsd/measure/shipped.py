@@ -1,10 +1,11 @@
 """What shipped weights, and what one would pick instead, do on clean renders, on cluttered ones and on photographs.
 
     python -m mmgsd.measure.shipped cloth cloth-paper daisy --photographs FOLDER    -> data/results/shipped.json
+    python -m mmgsd.measure.shipped robustness --photographs FOLDER    the models of that study, once they are trained
 
-A row a name: of weights in data/weights, or of a baseline, which is asked about each object with the true masks, and in
-photographs with those that the shipped weights see. The test images of the presets `SETS` have to be rendered. Tables
-of answers are kept, so that a killed call goes on.
+A row a name: of weights in data/weights; of a baseline, which is asked about each object with the true masks, and in
+photographs with those that the shipped weights see; or of each model of the study `STUDY` of the preset `paper`. The
+test images of the presets `SETS` have to be rendered. Tables of answers are kept, so that a killed call goes on.
 """
 
 from __future__ import annotations
@@ -22,7 +23,9 @@ import numpy as np
 from mmgsd.command import run_command
 from mmgsd.config import OBJECTS, EvaluateConfig, Paths, find_root, load_preset
 from mmgsd.dataset import load_dataset
+from mmgsd.experiments import configure_study
 from mmgsd.files import read_json, write_json
+from mmgsd.learn.checkpoints import WEIGHTS
 from mmgsd.learn.training import name_hardware
 from mmgsd.match.baselines import BASELINES, BaselineMatcher, FeatureMatcher
 from mmgsd.match.match import Match
@@ -34,6 +37,7 @@ from mmgsd.measure.metrics import aggregate
 from mmgsd.measure.photographs import measure_answers, measure_photographs, read_photographs
 from mmgsd.measure.uncertainty import get_modes, measure_modes, summarise_uncertainty
 
+STUDY = "robustness"
 SETS = ("paper", "workspace")  # presets whose test images are asked about
 LEVEL = 0.9  # of the radii whose promise is checked
 HEAD_PAIRS = 100  # of images whose modes are judged
@@ -42,15 +46,15 @@ RESULTS = "shipped.json"
 
 
 def measure_weights(
-    name: str, root: Path, *, photographs: Path | None = None, progress: bool = True
-) -> dict[str, Any]:  # fmt: skip
-    """The row of shipped weights: a dictionary a set of `SETS`, ``photographs``, ``milliseconds`` of one question.
+    name: str, root: Path, *, weights: Path | None = None, photographs: Path | None = None, progress: bool = True
+) -> dict[str, Any]:
+    """The row of ``weights``, or of shipped ones: a dictionary a set of `SETS`, ``photographs``, ``milliseconds``.
 
     Of a set: `mmgsd.measure.metrics.aggregate` over visible sources, `summarise_uncertainty` by the weights' own
     calibration, ``within_radius``, the share of modes with a true match within `Match.radius_px` (level 0.9), and
-    `measure_heads`.
+    `measure_heads`. ``milliseconds`` are those of one question about two new images.
     """
-    file = find_weights(name)
+    file = weights or find_weights(name)
     matcher = Matcher.load(file)
     row = {"object": matcher.object, "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
            "calibrated": matcher.calibration is not None}  # fmt: skip
@@ -119,19 +123,36 @@ def measure_baseline(
     return row
 
 
+def _measure(name: str, root: Path, photographs: Path | None) -> dict[str, dict[str, Any]]:
+    """The rows of a name that is asked for."""
+    how = {"photographs": photographs}
+    if name in BASELINES:
+        return {f"{object}-{name}": measure_baseline(name, object, root, **how) for object in OBJECTS}
+    if name != STUDY:
+        return {name: measure_weights(name, root, **how)}
+    preset, paths = load_preset(SETS[0]), Paths(root, SETS[0])
+    models = {f"{o}-{key}": m for o in OBJECTS for key, m in configure_study(preset, o, STUDY).items()}
+    files = {key: paths.model(model) / WEIGHTS for key, model in models.items()}
+    missing = [str(file) for file in files.values() if not file.is_file()]
+    if missing:
+        raise FileNotFoundError(
+            f"{missing[0]} does not exist: run python -m mmgsd.measure.matrix paper --study {STUDY}"
+        )
+    return {key: measure_weights(key, root, weights=file, **how) for key, file in files.items()}
+
+
 def main() -> None:
     """Measure some weights and baselines and put their rows into the results."""
     parser = argparse.ArgumentParser(prog="python -m mmgsd.measure.shipped", description=__doc__.split("\n")[0])
-    parser.add_argument("names", nargs="+", metavar="NAME", help=f"weights in data/weights, or {', '.join(BASELINES)}")
+    parser.add_argument(
+        "names", nargs="+", metavar="NAME", help=f"weights in data/weights, {', '.join(BASELINES)}, or {STUDY}"
+    )
     parser.add_argument("--photographs", type=Path, metavar="FOLDER", help="marked photographs, with index.json")
     asked = parser.parse_args()
     root = find_root()
     out = root / "data" / "results" / RESULTS
     for name in asked.names:
-        if name in BASELINES:
-            rows = {f"{o}-{name}": measure_baseline(name, o, root, photographs=asked.photographs) for o in OBJECTS}
-        else:
-            rows = {name: measure_weights(name, root, photographs=asked.photographs)}
+        rows = _measure(name, root, asked.photographs)
         kept = read_results(out)
         for key, row in rows.items():  # photographs are not at everybody's hand: a call without them keeps the row's
             before = kept.get(key, {})

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from mmgsd.config import OBJECTS
-from mmgsd.experiments import get_label
+from mmgsd.experiments import ROWS, get_label
 from mmgsd.match.baselines import BASELINES
 
 Rows = Mapping[str, Mapping[str, Any]]  # data/results/shipped.json, {name: what `mmgsd.measure.shipped` found}
@@ -32,16 +32,28 @@ def label_row(name: str) -> str:
 
 def make_pictures_table(rows: Rows) -> str:
     """Markdown of errors on clean and cluttered renders and of what is found in photographs, a row a model."""
+    return _make_pictures_lines(
+        rows, {name: label_row(name) for object in OBJECTS for name in list_names(rows, object)}
+    )
+
+
+def _make_pictures_lines(rows: Rows, labels: Mapping[str, str]) -> str:
     heads = ["", *(f"{word}: RMSE px" for word in SETS.values()), "photographs: found", "spurious", "best"]
     lines = [_join(heads), "|---" * len(heads) + "|"]
-    for object in OBJECTS:
-        for name in list_names(rows, object):
-            errors = [_format(rows[name].get(preset), "rmse_mean", 1, ".1f") for preset in SETS]
-            photographs = rows[name].get("photographs")
-            shares = [_format(photographs, key, 100, ".0f", " %") for key in ("found@5%", "spurious")]
-            lines.append(_join([f"{object}, {label_row(name)}", *errors, *shares,
-                                _format(photographs, "best", 1, ".1f", " %")]))  # fmt: skip
+    for name, label in labels.items():
+        errors = [_format(rows[name].get(preset), "rmse_mean", 1, ".1f") for preset in SETS]
+        photographs = rows[name].get("photographs")
+        shares = [_format(photographs, key, 100, ".0f", " %") for key in ("found@5%", "spurious")]
+        best = _format(photographs, "best", 1, ".1f", " %")
+        lines.append(_join([f"{name.partition('-')[0]}, {label}", *errors, *shares, best]))
     return "\n".join(lines)
+
+
+def make_parts_table(rows: Rows) -> str:
+    """`make_pictures_table` of the study that adds one part of the training after another."""
+    parts = {name: row.label for name, row in ROWS.items() if "robustness" in row.studies}
+    found = {f"{object}-{name}": label for object in OBJECTS for name, label in parts.items()}
+    return _make_pictures_lines(rows, {name: label for name, label in found.items() if name in rows})
 
 
 def make_knowledge_table(rows: Rows) -> str:

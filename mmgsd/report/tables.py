@@ -14,7 +14,13 @@ from mmgsd.experiments import MODELS, UNTRAINED, get_label
 from mmgsd.files import write_text
 from mmgsd.report.findings import make_claims_table, make_findings
 from mmgsd.report.results import PAPER, load_results, read_table, told_where
-from mmgsd.report.shipped import make_counts_sentence, make_knowledge_table, make_pictures_table, make_sources_sentence
+from mmgsd.report.shipped import (
+    make_counts_sentence,
+    make_knowledge_table,
+    make_parts_table,
+    make_pictures_table,
+    make_sources_sentence,
+)
 
 TABLED = ("main", "robustness", "hand_made", "chance")
 LABELS = {row.name: row.label for row in (*MODELS, *UNTRAINED) if {*row.studies} & {*TABLED}}  # rows in their order
@@ -215,6 +221,7 @@ TABLES: dict[str, tuple[str | tuple[str, ...], Callable[[Any], str]]] = {
     "seeds_quick": ("quick/seeds.json", make_seed_table),
     "uncertainty": ("paper/uncertainty.json", make_uncertainty_table),
     "pictures": ("shipped.json", make_pictures_table),
+    "parts": ("shipped.json", make_parts_table),
     "knowledge": ("shipped.json", make_knowledge_table),
     "sources": ("shipped.json", make_sources_sentence),
     "counts": ("shipped.json", make_counts_sentence),

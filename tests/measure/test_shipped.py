@@ -77,3 +77,9 @@ def test_a_baseline_is_told_where_the_object_is_seen() -> None:
     light[:2] = 255
     asked = [(dark, light, [[0, 0]]), (dark, dark, [[0, 0]])]
     assert list(Masked(Baseline(), Segmenter(), modes=4).match_many(asked)) == [(4, 8), (4, None)]
+
+
+def test_a_study_that_is_not_trained_says_how_to_train_it(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", [sys.executable, "robustness"])
+    with pytest.raises(FileNotFoundError, match="run python -m mmgsd.measure.matrix paper --study robustness"):
+        main()

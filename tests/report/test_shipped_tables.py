@@ -6,6 +6,7 @@ from mmgsd.report.shipped import (
     list_names,
     make_counts_sentence,
     make_knowledge_table,
+    make_parts_table,
     make_pictures_table,
     make_sources_sentence,
 )
@@ -33,6 +34,16 @@ def test_what_was_not_measured_is_a_dash() -> None:
     assert lines[3] == "| cloth, `cloth-paper` | 26.1 | 88.0 | – | – | – |"
     assert lines[4] == "| cloth, DAISY | 71.2 | – | – | – | – |"
     assert len({line.count("|") for line in lines}) == 1
+
+
+def test_parts_are_told_one_after_another() -> None:
+    rows = {"rope-mmgsd_heads": {"paper": SET}, "rope-mmgsd": {"paper": SET, "workspace": {"rmse_mean": 99.0}}}
+    lines = make_parts_table(rows | ROWS).splitlines()
+    assert [line.partition(" | ")[0] for line in lines[2:]] == [
+        "| rope, **MMGSD** (ours)",
+        "| rope, the same, with heads",
+    ]
+    assert "| 21.0 | 99.0 |" in lines[2]
 
 
 def test_knowledge_is_of_weights_alone() -> None:
