@@ -7,6 +7,7 @@ of the material points, and images without the object.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
@@ -19,6 +20,8 @@ SURFACE = 16  # numbers that describe a place's surface to the judge: is it a fo
 HIDDEN = 64  # units of the judge
 JITTER_PX = 6.0  # std by which true matches are moved before they are judged: modes are never exact
 ELSEWHERE = 2  # further places a query that are no match, and so not seen there
+BESIDE = 1 / 64  # of an image's longer side: so near to the object a pixel is taken for one on it
+LOOKED_UP = 128  # cells of the longer side that a mask is reduced to before
 ELSEWHERE_WEIGHT = 0.02  # of a heatmap's mass off the object, where the network itself says what is off it
 SHARES = {"mask": 1.0, "judge": 0.5, "present": 0.2}  # of the losses
 
@@ -103,16 +106,18 @@ def weigh_cells(said: Outputs, shape: tuple[int, int], mask: Tensor | None = Non
 def look_up(mask: np.ndarray | None, logits: Tensor | None, xy: np.ndarray, size: tuple[int, int]) -> np.ndarray | None:
     """How likely the object is seen at pixels ``xy`` (S, 2) of an image of ``size``, (S,) in [0, 1].
 
-    By the caller's ``mask`` (H, W) bool or else mask ``logits`` (hm, wm); None without either.
+    By the caller's ``mask`` (H, W) bool or else mask ``logits`` (hm, wm); None without either. A corner lies on the
+    object's border, and a click or a mark beside it: the likeliest place within `BESIDE` counts.
     """
-    if mask is not None:
-        columns, rows = np.rint(xy).astype(int).T
-        return mask[rows.clip(0, size[1] - 1), columns.clip(0, size[0] - 1)].astype(np.float32)
-    if logits is None:
+    if mask is None and logits is None:
         return None
-    grid = (torch.from_numpy(xy).to(logits.device).float() + 0.5) / logits.new_tensor(size) * 2 - 1
-    found = F.grid_sample(logits[None, None], grid[None, None], padding_mode="border", align_corners=False)
-    return found[0, 0, 0].sigmoid().cpu().numpy()
+    known = (logits.sigmoid() if mask is None else torch.from_numpy(mask).float())[None, None]
+    coarse = [math.ceil(side * min(1, LOOKED_UP / max(known.shape))) for side in known.shape[2:]]
+    reach = max(1, round(BESIDE * max(coarse)))
+    known = F.max_pool2d(F.adaptive_max_pool2d(known, coarse), 2 * reach + 1, 1, reach)
+    grid = (torch.from_numpy(xy).to(known.device).float() + 0.5) / known.new_tensor(size) * 2 - 1
+    found = F.grid_sample(known, grid[None, None], padding_mode="border", align_corners=False)
+    return found[0, 0, 0].cpu().numpy()
 
 
 def compute_mask_loss(logits: Tensor, mask: Tensor) -> Tensor:

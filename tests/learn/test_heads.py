@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 import torch
 
-from mmgsd.learn.heads import Heads, compute_judge_loss, compute_mask_loss, compute_present_loss
+from mmgsd.learn.heads import Heads, compute_judge_loss, compute_mask_loss, compute_present_loss, look_up
 from mmgsd.learn.network import build_network
 
 
@@ -75,3 +76,15 @@ def test_the_judge_takes_any_leading_shape(roles: int) -> None:
     heads = Heads(8, 4, roles)
     logits = heads.judge(torch.rand(2, 5, 1, 4), torch.rand(2, 5, 3, 4 * roles), torch.rand(2, 5, 3, 16))
     assert logits.shape == (2, 5, 3)
+
+
+@pytest.mark.parametrize("size", [(64, 48), (485, 364), (4000, 3000)], ids=str)
+@pytest.mark.parametrize("own", [True, False], ids=["logits", "caller's mask"])
+def test_a_click_just_beside_the_object_is_on_it(size: tuple[int, int], own: bool) -> None:
+    mask = np.zeros(size[::-1], bool)
+    mask[size[1] // 4 : size[1] // 2, size[0] // 4 : size[0] // 2] = True
+    logits = torch.from_numpy(cv2.resize(mask.astype(np.float32), (128, 96))) * 20 - 10
+    corner = np.array([[size[0] / 4, size[1] / 4]])
+    beside, far = corner - size[0] / 100, corner - size[0] / 16
+    found = look_up(*((None, logits) if own else (mask, None)), np.concatenate([corner, beside, far]), size)
+    np.testing.assert_allclose(found, [1, 1, 0], atol=0.01)
