@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import io
 import json
 import struct
 import zlib
@@ -230,20 +229,6 @@ def sample_pairs(
         raise ValueError(f"episode must hold at least 2 images to make a pair, got {able.sum()}")
     picked = rng.choice(len(first), n_pairs, replace=n_pairs > len(first))
     return np.stack([first[picked], second[picked]], axis=1)
-
-
-def encode_image(image: np.ndarray) -> bytes:
-    """Lossless WebP bytes of an (H, W, 3) uint8 image; the same pixels always give the same bytes."""
-    buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, "WEBP", lossless=True, quality=0, method=0)
-    return buffer.getvalue()
-
-
-def encode_mask(mask: np.ndarray) -> bytes:
-    """1-bit PNG bytes of an (H, W) bool mask."""
-    buffer = io.BytesIO()
-    Image.fromarray(mask).save(buffer, "PNG", optimize=True)
-    return buffer.getvalue()
 
 
 def _open_image(path: Path, size: tuple[int, int]) -> Image.Image:

@@ -15,8 +15,8 @@ import pandas as pd
 import pytest
 
 from mmgsd.config import DEFAULT_GROUP, IMAGE_SIZE
-from mmgsd.dataset import encode_image, encode_mask
 from mmgsd.dataset_format import FORMAT
+from mmgsd.images import encode_image, encode_mask
 from mmgsd.symmetry import GRID_GROUPS, LINE_GROUPS, load_group, load_mirror
 
 os.environ.setdefault("MPLBACKEND", "Agg")  # no window, and before anything imports matplotlib

@@ -14,14 +14,13 @@ import pytest
 from mmgsd.dataset import (
     DatasetError,
     check_dataset,
-    encode_image,
-    encode_mask,
     hold_out,
     join_datasets,
     load_dataset,
     measure_images,
     sample_pairs,
 )
+from mmgsd.images import encode_image, encode_mask
 
 IMAGE, MASK = "images/00000.webp", "masks/00000.png"
 

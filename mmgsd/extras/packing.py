@@ -26,13 +26,12 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
-from PIL import Image
 from tqdm.auto import tqdm
 
 from mmgsd.checks import read_flag
 from mmgsd.command import run_command
 from mmgsd.config import OBJECTS, Paths, find_root, load_preset
-from mmgsd.dataset import Dataset, check_dataset, encode_mask, load_dataset
+from mmgsd.dataset import Dataset, check_dataset, load_dataset
 from mmgsd.dataset_format import SPLITS, TABLES, find_owner, is_member
 from mmgsd.extras.croissant import write_croissant
 from mmgsd.files import (
@@ -47,6 +46,7 @@ from mmgsd.files import (
     write_json,
     writing,
 )
+from mmgsd.images import encode_image, encode_mask
 
 QUALITY = 50  # of WebP, 1 to 100: 4,000 images with their labels stay under 60 MB
 LABEL_STEP = 1 / 16  # px that labels are rounded to
@@ -185,19 +185,13 @@ def _encode(splits: list[Dataset], quality: int) -> Iterator[tuple[str, bytes]]:
     """Names and contents of a packed data set's files."""
     for data in splits:
         for index, row in enumerate(data.labels.itertuples()):
-            yield row.file, _encode_webp(data.load_image(index), quality)
+            yield row.file, encode_image(data.load_image(index), quality=quality)
             yield row.mask, encode_mask(data.load_mask(index))
     labels = pd.concat([data.labels for data in splits], ignore_index=True)
     table, counts = _encode_labels(labels, splits[0].size), {data.split: len(data) for data in splits}
     yield "labels.parquet", table
     own = {"images": counts, "packed": {"quality": quality}, "labels_sha256": hashlib.sha256(table).hexdigest()}
     yield "dataset.json", json.dumps({**splits[0].info, **own}).encode()
-
-
-def _encode_webp(image: np.ndarray, quality: int) -> bytes:
-    buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, "WEBP", quality=quality, method=6)
-    return buffer.getvalue()
 
 
 def _encode_labels(labels: pd.DataFrame, size: tuple[int, int]) -> bytes:

@@ -10,7 +10,6 @@ stderr.
 from __future__ import annotations
 
 import ctypes
-import io
 import json
 import os
 import signal
@@ -23,13 +22,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from PIL import Image
-
 from mmgsd.config import RenderConfig, from_dict
 from mmgsd.files import writing
+from mmgsd.images import encode_image, encode_mask
 from mmgsd.scene.sheet import Sheet
 
-WEBP = {"lossless": True, "quality": 20, "method": 0}  # 25 ms an image; more effort saves a few per cent of space
 PR_SET_PDEATHSIG = 1  # of Linux: which signal a process gets when its parent ends
 
 
@@ -82,16 +79,10 @@ def _watch(parent: int) -> None:
 def write_view(archive: zipfile.ZipFile, episode: int, index: int, view: Any) -> dict[str, Any]:
     """Add a view's image and mask to the archive; its labels as JSON values."""
     stem = f"{episode:06d}_{index:02d}"
-    _add(archive, f"{stem}.webp", _encode(Image.fromarray(view.image), "WEBP", **WEBP))
-    _add(archive, f"{stem}_mask.png", _encode(Image.fromarray(view.mask), "PNG"))
+    _add(archive, f"{stem}.webp", encode_image(view.image))
+    _add(archive, f"{stem}_mask.png", encode_mask(view.mask))
     arrays = {name: getattr(view, name).tolist() for name in ("xy", "visible", "intrinsics", "camera_pose")}
     return {**arrays, "info": view.info}
-
-
-def _encode(image: Image.Image, kind: str, **options: Any) -> bytes:
-    buffer = io.BytesIO()
-    image.save(buffer, kind, **options)
-    return buffer.getvalue()
 
 
 def _add(archive: zipfile.ZipFile, name: str, data: bytes) -> None:
