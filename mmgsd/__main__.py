@@ -23,11 +23,11 @@ def main(arguments: list[str] | None = None) -> None:
     written or one of many images could not be answered, and with 130 after Ctrl-C.
     """
     parser = make_parser()
-    asked = parser.parse_args(arguments)
+    args = parser.parse_args(arguments)
     try:
-        asked.run(asked)
+        args.run(args)
     except KeyboardInterrupt:
-        parser.exit(130, f"stopped: {_say_kept(asked)}\n")
+        parser.exit(130, f"stopped: {_say_kept(args)}\n")
     except BrokenPipeError:  # who reads the output has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (ValueError, FileNotFoundError, IsADirectoryError, PermissionError) as error:
@@ -38,8 +38,8 @@ def main(arguments: list[str] | None = None) -> None:
         parser.exit(1, f"error: {cli.say_error(error)}\n")
 
 
-def _say_kept(asked: argparse.Namespace) -> str:
-    written = [str(path) for path in (getattr(asked, name, None) for name in ("out", "csv")) if path]
+def _say_kept(args: argparse.Namespace) -> str:
+    written = [str(path) for path in (getattr(args, name, None) for name in ("out", "csv")) if path]
     if not written:
         return "there was nothing to keep"
     return f"{' and '.join(written)} {'is as it was' if len(written) == 1 else 'are as they were'} before"

@@ -32,51 +32,51 @@ def say_error(error: BaseException) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
-def match(asked: argparse.Namespace) -> None:
+def match(args: argparse.Namespace) -> None:
     """Answer for one image, or for each of a folder."""
-    if asked.image1.is_dir():
-        _match_folder(asked)
+    if args.image1.is_dir():
+        _match_folder(args)
         return
-    _check_written(asked, [asked.image1])
-    if asked.pictures:
-        raise ValueError(f"--pictures must be given with a folder as image1, got {asked.image1}: use --out")
-    images = [mmgsd.read_image(path) for path in (asked.image0, asked.image1)]
-    files = {"mask0": asked.mask0, "mask1": asked.mask1}
+    _check_written(args, [args.image1])
+    if args.pictures:
+        raise ValueError(f"--pictures must be given with a folder as image1, got {args.image1}: use --out")
+    images = [mmgsd.read_image(path) for path in (args.image0, args.image1)]
+    files = {"mask0": args.mask0, "mask1": args.mask1}
     masks = {k: f and read_mask(f, im.shape[:2]) for (k, f), im in zip(files.items(), images, strict=True)}
-    answer = mmgsd.load(asked.weights).match(*images, asked.xy, n=asked.n, **masks)
+    answer = mmgsd.load(args.weights).match(*images, args.xy, n=args.n, **masks)
     described = describe_answer(answer)
-    if asked.out:
-        draw_answer(answer, asked.out)
-    if asked.csv:
-        with _writing_rows(asked.csv) as table:
-            table.writerows(_list_rows(asked.image1.name, described))
-    print(json.dumps(described) if asked.json else "\n".join(map(format_query, described)), flush=True)
+    if args.out:
+        draw_answer(answer, args.out)
+    if args.csv:
+        with _writing_rows(args.csv) as table:
+            table.writerows(_list_rows(args.image1.name, described))
+    print(json.dumps(described) if args.json else "\n".join(map(format_query, described)), flush=True)
 
 
-def _match_folder(asked: argparse.Namespace) -> None:
+def _match_folder(args: argparse.Namespace) -> None:
     """Answer for one image after the other; RuntimeError at the end where some could not be answered for."""
-    if asked.out or asked.mask0 or asked.mask1:
-        raise ValueError(f"--out, --mask0 and --mask1 must be given with one image1, got the folder {asked.image1}: "
+    if args.out or args.mask0 or args.mask1:
+        raise ValueError(f"--out, --mask0 and --mask1 must be given with one image1, got the folder {args.image1}: "
                          "use --pictures")  # fmt: skip
     from tqdm import tqdm
 
-    paths, image0 = list_images(asked.image1), mmgsd.read_image(asked.image0)
-    _check_written(asked, paths)
-    check_pixels(asked.xy, image0.shape[1::-1])
-    matcher, failed = mmgsd.load(asked.weights), []
+    paths, image0 = list_images(args.image1), mmgsd.read_image(args.image0)
+    _check_written(args, paths)
+    check_pixels(args.xy, image0.shape[1::-1])
+    matcher, failed = mmgsd.load(args.weights), []
     matcher.compute_input_size(image0, "image0")
     bar = tqdm(paths, desc="match", unit="image", disable=not sys.stderr.isatty())
     named, frames = itertools.tee(_read_readable(matcher, bar, failed))
-    answers = matcher.match_many(((image0, image1, asked.xy) for _, image1 in frames), n=asked.n)
-    with _writing_rows(asked.csv) if asked.csv else nullcontext() as table:
+    answers = matcher.match_many(((image0, image1, args.xy) for _, image1 in frames), n=args.n)
+    with _writing_rows(args.csv) if args.csv else nullcontext() as table:
         for (path, _), answer in zip(named, answers, strict=True):
             described = describe_answer(answer)
             if table:
                 table.writerows(_list_rows(path.name, described))
-            if asked.pictures:
-                draw_answer(answer, asked.pictures / f"{path.name}.png")
+            if args.pictures:
+                draw_answer(answer, args.pictures / f"{path.name}.png")
             with tqdm.external_write_mode():
-                _print_answer(path.name, described, as_json=asked.json)
+                _print_answer(path.name, described, as_json=args.json)
     if failed:
         raise RuntimeError(f"{len(failed)} of {len(paths)} images could not be answered for: {', '.join(failed)}")
 
@@ -120,21 +120,21 @@ def _writing_rows(path: Path) -> Iterator[csv.DictWriter]:
         yield table
 
 
-def _check_written(asked: argparse.Namespace, paths: list[Path]) -> None:
+def _check_written(args: argparse.Namespace, paths: list[Path]) -> None:
     """ValueError for a result that would replace an image, or a picture of more queries than a page holds."""
-    read = {path.resolve() for path in (asked.image0, asked.mask0, asked.mask1, *paths) if path}
+    read = {path.resolve() for path in (args.image0, args.mask0, args.mask1, *paths) if path}
     for name in ("out", "csv"):
-        place = getattr(asked, name)
+        place = getattr(args, name)
         if place and place.resolve() in read:
             raise ValueError(f"--{name} must not be one of the images, got {place}")
-    if asked.pictures and asked.pictures.resolve() in {path.parent for path in read}:
-        raise ValueError(f"--pictures must not be a folder of the images, got {asked.pictures}")
-    if asked.out or asked.pictures:
+    if args.pictures and args.pictures.resolve() in {path.parent for path in read}:
+        raise ValueError(f"--pictures must not be a folder of the images, got {args.pictures}")
+    if args.out or args.pictures:
         from mmgsd.figures.plots import PAGE_QUERIES
 
-        if len(asked.xy) > PAGE_QUERIES:
-            option = "--out" if asked.out else "--pictures"
-            raise ValueError(f"--xy must be given at most {PAGE_QUERIES} times with {option}, got {len(asked.xy)}")
+        if len(args.xy) > PAGE_QUERIES:
+            option = "--out" if args.out else "--pictures"
+            raise ValueError(f"--xy must be given at most {PAGE_QUERIES} times with {option}, got {len(args.xy)}")
 
 
 def draw_answer(answer: Any, path: Path) -> None:
@@ -153,59 +153,59 @@ def save_picture(figure: Any, path: Path) -> None:
         figure.savefig(aside, format=path.suffix[1:].lower(), dpi=DPI, bbox_inches="tight", pad_inches=0.05)
 
 
-def segment(asked: argparse.Namespace) -> None:
+def segment(args: argparse.Namespace) -> None:
     """Write the probability of the object in each pixel as a grey PNG, white where it is certain."""
-    if asked.out.suffix.lower() != ".png":
-        raise ValueError(f"out must end with .png, got {asked.out}")
-    if asked.out.resolve() == asked.image.resolve():
-        raise ValueError(f"out must not be the image itself, got {asked.out}")
-    mask = mmgsd.load(asked.weights).segment(mmgsd.read_image(asked.image))
+    if args.out.suffix.lower() != ".png":
+        raise ValueError(f"out must end with .png, got {args.out}")
+    if args.out.resolve() == args.image.resolve():
+        raise ValueError(f"out must not be the image itself, got {args.out}")
+    mask = mmgsd.load(args.weights).segment(mmgsd.read_image(args.image))
     grey = np.rint(255 * mask).astype(np.uint8)
-    write_bytes(asked.out, cv2.imencode(".png", grey)[1].tobytes())
-    print(f"{asked.out}: brighter than half on the object, {np.mean(mask > 0.5):.0%} of the image")
+    write_bytes(args.out, cv2.imencode(".png", grey)[1].tobytes())
+    print(f"{args.out}: brighter than half on the object, {np.mean(mask > 0.5):.0%} of the image")
 
 
-def measure(asked: argparse.Namespace) -> None:
-    """Measure on marked photographs: print a table or JSON, write a contact sheet and the results where asked."""
+def measure(args: argparse.Namespace) -> None:
+    """Measure on marked photographs: print a table or JSON, write a contact sheet and the results where asked for."""
     from mmgsd.figures.photographs import ContactSheet
     from mmgsd.measure.photographs import check_name, make_photographs_table, measure_photographs, store_photographs
 
-    if asked.store:
-        check_name(asked.store)
-    if asked.out and asked.out.exists() and asked.out.resolve().is_relative_to(asked.place.resolve()):
-        raise ValueError(f"--out must not replace a file among the photographs, got {asked.out}")
+    if args.store:
+        check_name(args.store)
+    if args.out and args.out.exists() and args.out.resolve().is_relative_to(args.place.resolve()):
+        raise ValueError(f"--out must not replace a file among the photographs, got {args.out}")
     sheet = ContactSheet()
-    looking = {"seen": sheet.add} if asked.out else {}
-    results = measure_photographs(asked.weights, asked.place, progress=sys.stderr.isatty(), **looking)
-    if asked.out:
-        save_picture(sheet.plot(), asked.out)
-    if asked.store:
-        store_photographs(results, asked.store)
-    print(json.dumps(results) if asked.json else make_photographs_table(results), flush=True)
+    looking = {"seen": sheet.add} if args.out else {}
+    results = measure_photographs(args.weights, args.place, progress=sys.stderr.isatty(), **looking)
+    if args.out:
+        save_picture(sheet.plot(), args.out)
+    if args.store:
+        store_photographs(results, args.store)
+    print(json.dumps(results) if args.json else make_photographs_table(results), flush=True)
 
 
-def export(asked: argparse.Namespace) -> None:
+def export(args: argparse.Namespace) -> None:
     """Write a network as ONNX."""
     from mmgsd.extras.exporting import export_onnx
 
-    difference = export_onnx(mmgsd.load(asked.weights), asked.out)
-    print(f"{asked.out}: images of any size in, descriptors as of Matcher.describe out, the mean over quarter turns "
+    difference = export_onnx(mmgsd.load(args.weights), args.out)
+    print(f"{args.out}: images of any size in, descriptors as of Matcher.describe out, the mean over quarter turns "
           f"included; they differ from torch's by {difference:.1e} at most")  # fmt: skip
 
 
-def calibrate(asked: argparse.Namespace) -> None:
+def calibrate(args: argparse.Namespace) -> None:
     """Fit what ellipses, radii and confidences promise, and keep it in the file of weights."""
     from mmgsd.measure.calibration import calibrate_weights
 
-    found = mmgsd.load(calibrate_weights(asked.weights, asked.data, overwrite=asked.overwrite)).calibration
-    print(f"{asked.weights}: calibrated on {found.pairs} pairs of held-out simulations; each half by the other: "
+    found = mmgsd.load(calibrate_weights(args.weights, args.data, overwrite=args.overwrite)).calibration
+    print(f"{args.weights}: calibrated on {found.pairs} pairs of held-out simulations; each half by the other: "
           f"ECE {found.ece_ellipse:.3f} of ellipses, {found.ece_confidence:.3f} of confidences")  # fmt: skip
 
 
-def heads(asked: argparse.Namespace) -> None:
+def heads(args: argparse.Namespace) -> None:
     """Measure what weights tell beside their matches, and store it."""
     from mmgsd.config import EvaluateConfig
     from mmgsd.files import read_json
     from mmgsd.measure.heads import evaluate_heads
 
-    print(json.dumps(read_json(evaluate_heads(asked.weights, asked.data, EvaluateConfig(pairs=100), asked.out))))
+    print(json.dumps(read_json(evaluate_heads(args.weights, args.data, EvaluateConfig(pairs=100), args.out))))

@@ -226,8 +226,8 @@ def find_file(path: Path | str, name: str = "path") -> Path:
     """
     if not isinstance(path, str | Path) or not str(path).strip():
         raise ValueError(f"{name} must be the path of a file, got {path!r}")
-    asked = Path(path).expanduser()
-    places = dict.fromkeys(place / asked for place in (Path.cwd(), find_root()))  # an absolute path stays as it is
+    given = Path(path).expanduser()
+    places = dict.fromkeys(place / given for place in (Path.cwd(), find_root()))  # an absolute path stays as it is
     for place in places:
         if place.is_file():
             return place

@@ -243,22 +243,22 @@ def main() -> None:
     parser.add_argument("action", choices=("pack", "unpack", "describe", "sample"))
     parser.add_argument("preset", nargs="?", default="paper")
     parser.add_argument("--quality", type=int, default=QUALITY, help="of WebP, 1 to 100 (default %(default)s)")
-    asked = parser.parse_args()
-    load_preset(asked.preset)
-    paths = Paths(find_root(), asked.preset)
-    sample = paths.root / "data" / "sample" / ("" if asked.preset == "paper" else asked.preset)
+    args = parser.parse_args()
+    load_preset(args.preset)
+    paths = Paths(find_root(), args.preset)
+    sample = paths.root / "data" / "sample" / ("" if args.preset == "paper" else args.preset)
     for name in OBJECTS:
-        folder, archive = paths.dataset(name), paths.root / "data" / "packs" / f"{asked.preset}-{name}.zip"
-        if asked.action == "pack":
-            note = pack_dataset(folder, archive, quality=asked.quality)
+        folder, archive = paths.dataset(name), paths.root / "data" / "packs" / f"{args.preset}-{name}.zip"
+        if args.action == "pack":
+            note = pack_dataset(folder, archive, quality=args.quality)
             print(f"{archive}: {note['bytes'] / 1e6:.1f} MB, SHA-256 {note['sha256']}, seed {note['seed']}")
-        elif asked.action == "describe":
+        elif args.action == "describe":
             print(describe_archive(archive, folder))
-        elif asked.action == "unpack":
+        elif args.action == "unpack":
             print(f"{unpack_dataset(archive, folder)}: complete and checked")
         else:
-            print(f"{write_sample(folder, sample / name, quality=asked.quality)}: checked")
-    if asked.action == "sample":
+            print(f"{write_sample(folder, sample / name, quality=args.quality)}: checked")
+    if args.action == "sample":
         from mmgsd.measure.photographs import write_sample_marks  # needs torch, as nothing else here
 
         print(f"{write_sample_marks(sample)}: their corners and ends")

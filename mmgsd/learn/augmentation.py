@@ -72,8 +72,8 @@ class Warp:
         parts = np.concatenate([np.cos(down), np.sin(down)], axis=1)  # (rows, 2 K)
         waves = np.concatenate([np.sin(across), np.cos(across)], axis=1)  # (columns, 2 K)
         bend = np.einsum("rk,ck,kd->rcd", parts, waves, np.tile(self.amplitudes, (2, 1)), optimize=True)
-        asked = np.stack(np.meshgrid(columns, rows), axis=-1) + bend
-        return (asked - self.affine[:, 2]) @ np.linalg.inv(self.affine[:, :2]).T
+        bent = np.stack(np.meshgrid(columns, rows), axis=-1) + bend
+        return (bent - self.affine[:, 2]) @ np.linalg.inv(self.affine[:, :2]).T
 
     def move(self, xy: np.ndarray) -> np.ndarray:
         """New px of old px (..., 2); exact to 0.02 px."""

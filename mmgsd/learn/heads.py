@@ -78,13 +78,13 @@ class Heads(nn.Module):
         pooled = torch.cat([coarse.mean((2, 3)), coarse.amax((2, 3))], 1)
         return self.mask(x)[:, 0].float(), self.surface(features).float(), self.present(pooled)[:, 0].float()
 
-    def judge(self, asked: Tensor, there: Tensor, surface: Tensor) -> Tensor:
+    def judge(self, source: Tensor, there: Tensor, surface: Tensor) -> Tensor:
         """Logits (...) that the surface of the pixel asked about is seen at a place.
 
-        ``asked`` (..., D) is its descriptor as a source, ``there`` (..., roles D) what the place has, ``surface``
+        ``source`` (..., D) is its descriptor, ``there`` (..., roles D) what the place has, ``surface``
         (..., SURFACE). A place shows what its own descriptor as a source says: it need not be what hides below it.
         """
-        apart = [asked - role for role in there.chunk(self.roles, -1)]
+        apart = [source - role for role in there.chunk(self.roles, -1)]
         near = [difference.square().sum(-1, keepdim=True).clamp(max=50) / 10 for difference in apart]
         return self.judge_layers(torch.cat([*apart, *near, surface], -1))[..., 0]
 

@@ -42,9 +42,9 @@ def mmgsd(squared_distances: Tensor, target: Tensor) -> Tensor:
     with the sign of its exponent corrected.
     """
     _check_same_shape(squared_distances, target)
-    asked = target.sum(-1) > 0
+    matched = target.sum(-1) > 0
     loss = -(target * torch.log_softmax(-squared_distances, -1)).sum(-1)
-    return (loss * asked).sum() / asked.sum().clamp(min=1)
+    return (loss * matched).sum() / matched.sum().clamp(min=1)
 
 
 def unimodal(squared_distances: Tensor, target: Tensor) -> Tensor:

@@ -87,7 +87,7 @@ def _compute_judge_loss(
     points = torch.multinomial(batch.askable.float() + 1e-9, JUDGED, True, generator=generator)  # (B, Q)
     rows = torch.arange(images, device=points.device)
     known = batch.askable[rows[:, None], points]  # (B, Q)
-    asked = sample_descriptors(said.descriptors.detach(), batch.xy[rows[:, None], points], size)[..., :dim]
+    source = sample_descriptors(said.descriptors.detach(), batch.xy[rows[:, None], points], size)[..., :dim]
     target = rows.roll(1)  # image whose places are judged, of each source
     orbit = permutations[:, points].permute(1, 2, 0)  # (B, Q, G)
     modes, other = batch.xy[target[:, None, None], orbit], batch.askable[target[:, None, None], orbit]
@@ -97,7 +97,7 @@ def _compute_judge_loss(
     there = torch.cat([said.descriptors.detach(), said.surface], 1)[target]
     there = sample_descriptors(there, places.flatten(1, 2), size).view(*places.shape[:3], -1)
     channels = said.descriptors.shape[1]
-    logits = heads.judge(asked[:, :, None], there[..., :channels], there[..., channels:])
+    logits = heads.judge(source[:, :, None], there[..., :channels], there[..., channels:])
     return compute_judge_loss(logits, seen, valid & known[..., None])
 
 

@@ -38,16 +38,16 @@ def make_prototypes(xy: np.ndarray, permutations: np.ndarray, dim: int, diagonal
     return torch.from_numpy(features.astype(np.float32))
 
 
-def compute_prototype_loss(descriptors: Tensor, asked: Tensor, prototypes: Tensor, permutations: Tensor) -> Tensor:
+def compute_prototype_loss(descriptors: Tensor, askable: Tensor, prototypes: Tensor, permutations: Tensor) -> Tensor:
     """Cross-entropy of the visible points' descriptors with their own orbit among all material points.
 
-    ``descriptors`` (B, P, D) at the projected points, ``asked`` (B, P) bool, ``prototypes`` (P, D) of which symmetric
+    ``descriptors`` (B, P, D) at the projected points, ``askable`` (B, P) bool, ``prototypes`` (P, D) of which symmetric
     points share the mean, ``permutations`` (G, P).
     """
     if descriptors.shape[1:] != prototypes.shape:
         raise ValueError(f"prototypes must be {tuple(descriptors.shape[1:])}, got {tuple(prototypes.shape)}")
     tied = prototypes[permutations].mean(0)  # (P, D)
-    image, point = asked.nonzero(as_tuple=True)
+    image, point = askable.nonzero(as_tuple=True)
     squared = compute_squared_distances(descriptors[image, point][None], tied[None])[0]  # (n, P)
     log_share = torch.log_softmax(-squared, -1)
     own = permutations[:, point].T  # (n, G)

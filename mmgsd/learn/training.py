@@ -180,9 +180,9 @@ class _Run:
     def compute_dense_loss(self, descriptors: Tensor, batch: Batch) -> Tensor:
         """The prototypes' loss, on a part of the material points in turn."""
         turn = torch.arange(batch.askable.shape[1], device=self.device) % PROTOTYPE_EVERY
-        asked = batch.askable & (turn == self.step % PROTOTYPE_EVERY)
+        askable = batch.askable & (turn == self.step % PROTOTYPE_EVERY)
         sampled = sample_descriptors(descriptors[:, : self.config.descriptor_dim], batch.xy, self.size)
-        return compute_prototype_loss(sampled, asked, self.prototypes, self.permutations)
+        return compute_prototype_loss(sampled, askable, self.prototypes, self.permutations)
 
     def make_matcher(self) -> Matcher:
         """A matcher of the averaged weights; of a contrastive loss, its bandwidth calibrated."""

@@ -153,8 +153,8 @@ class Match:
         if rows.ndim > 1:
             raise IndexError(f"index must have one axis, got shape {np.shape(index)}")
         fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        asked = {name: value for name, value in fields.items() if name not in SHARED and value is not None}
-        return dataclasses.replace(self, **{name: value[rows] for name, value in asked.items()})
+        per_query = {name: value for name, value in fields.items() if name not in SHARED and value is not None}
+        return dataclasses.replace(self, **{name: value[rows] for name, value in per_query.items()})
 
     def __repr__(self) -> str:
         sizes = (f"{image.shape[1]} x {image.shape[0]} px" for image in (self.image0, self.image1))

@@ -159,8 +159,8 @@ class Matcher:
         places = modes.to(self.device).float().nan_to_num(-0.5)
         there = sample_descriptors(there, places.flatten(0, 1)[None], sizes[1])[0].view(*modes.shape[:2], -1)
         channels = len(said1.descriptors)
-        asked = self._sample_sources(said0, xy, sizes[0])[0][:, None]  # (S, 1, D)
-        logits = self.network.heads.judge(asked, there[..., :channels], there[..., channels:])
+        source = self._sample_sources(said0, xy, sizes[0])[0][:, None]  # (S, 1, D)
+        logits = self.network.heads.judge(source, there[..., :channels], there[..., channels:])
         return torch.sigmoid(logits) * modes.isfinite().all(-1).to(logits.device)
 
     def segment(self, image: Any) -> np.ndarray:

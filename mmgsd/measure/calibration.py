@@ -171,11 +171,11 @@ def calibrate_temperature(
     orbits = data.group(matcher.config.group).permutations[:, points].T  # (S, G)
     matcher.temperature, logits, true = 1.0, [], []
     for first, second in chosen:
-        asked = data.visible[first, points]
-        xy = torch.from_numpy(data.xy[first, points[asked]])
+        seen = data.visible[first, points]
+        xy = torch.from_numpy(data.xy[first, points[seen]])
         heatmap = matcher.compute_heatmaps(descriptors[first], descriptors[second], xy, data.size)
         logits.append(heatmap.flatten(1).clamp(min=1e-38).log())
-        true.append(_find_cells(data.xy[second][orbits[asked]], data.size, heatmap.shape[-2:]))
+        true.append(_find_cells(data.xy[second][orbits[seen]], data.size, heatmap.shape[-2:]))
     logits, true = torch.cat(logits), torch.from_numpy(np.concatenate(true)).to(logits[0].device)
 
     def measure(log_temperature: float) -> float:

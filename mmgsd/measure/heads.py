@@ -102,8 +102,8 @@ def _ask_modes(
     orbits = group.permutations[:, points].T  # (P, n)
     scores, true = [np.empty(0)], [np.empty(0, bool)]
     for first, second in tqdm(draw_pairs(data, config), desc="heads", disable=not progress, leave=False):
-        asked = data.visible[first, points]
-        xy, orbit = torch.from_numpy(data.xy[first, points[asked]]), orbits[asked]
+        seen = data.visible[first, points]
+        xy, orbit = torch.from_numpy(data.xy[first, points[seen]]), orbits[seen]
         modes = _find_modes(matcher, said[first], said[second], xy, data.size, n=orbits.shape[1])
         visible = matcher.compute_visible(said[first], said[second], xy, modes, (data.size, data.size))
         paired = assign_modes(modes.double().cpu().numpy(), data.xy[second][orbit].astype(float))  # of each true match

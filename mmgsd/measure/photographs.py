@@ -169,8 +169,8 @@ def ask_photographs(
     """
     askable = [photograph for photograph in photographs if photograph.askable]
     spread = np.linspace(0, len(askable) - 1, min(sources, len(askable))).round().astype(int)
-    asked = [(source, source.read()) for source in (askable[k] for k in np.unique(spread))]
-    pairs = [(source, target) for target in photographs for source in asked if source[0].path != target.path]
+    read = [(source, source.read()) for source in (askable[k] for k in np.unique(spread))]
+    pairs = [(source, target) for target in photographs for source in read if source[0].path != target.path]
 
     def ask() -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         last, image = None, None

@@ -148,11 +148,11 @@ def main() -> None:
         "names", nargs="+", metavar="NAME", help=f"weights in data/weights, {', '.join(BASELINES)}, or {STUDY}"
     )
     parser.add_argument("--photographs", type=Path, metavar="FOLDER", help="marked photographs, with index.json")
-    asked = parser.parse_args()
+    args = parser.parse_args()
     root = find_root()
     out = root / "data" / "results" / RESULTS
-    for name in asked.names:
-        rows = _measure(name, root, asked.photographs)
+    for name in args.names:
+        rows = _measure(name, root, args.photographs)
         kept = read_results(out)
         for key, row in rows.items():  # photographs are not at everybody's hand: a call without them keeps the row's
             before = kept.get(key, {})
