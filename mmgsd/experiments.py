@@ -126,6 +126,7 @@ UNTRAINED = (
     Model("centre", "object's centre", "", studies=("chance",), short="Object centre", colour="#404040"),
 )
 ROWS = {row.name: row for row in (*MODELS, *UNTRAINED)}
+SHIPPED = {"shipped": "", "mmgsd": "-paper", "spcl": "-spcl"}  # row: what its files' names in data/weights end with
 SMALL = ("symmetry", "budget", "sigma", "fixes", "robustness")  # studies of the equal, smaller budget
 RUN = ("first", "symmetry", "budget", "sigma", "main")  # studies that are run unless one is named, in this order
 STUDIES = (*RUN, "robustness", "shipped")  # on a preset's own images and one seed: not "fixes" and "seeds"

@@ -13,7 +13,7 @@ import numpy as np
 from mmgsd.checks import check_choice
 from mmgsd.config import OBJECTS, PRESETS, Paths, find_root, find_shipped, load_preset
 from mmgsd.dataset import Dataset, load_dataset, sample_pairs
-from mmgsd.experiments import configure_study, get_label
+from mmgsd.experiments import SHIPPED, configure_study, get_label
 from mmgsd.images import decode_image, to_rgb
 from mmgsd.learn.checkpoints import WEIGHTS
 from mmgsd.match.baselines import BASELINES, BaselineMatcher
@@ -101,16 +101,9 @@ def load_matchers(name: str, preset: str = SAMPLE) -> dict[str, Any]:
 
 
 def load_shipped(name: str) -> dict[str, Matcher]:
-    """{label: matcher} of every model in data/weights that is of the object: ``NAME`` (MMGSD) and ``NAME-METHOD``."""
-    matchers = {}
-    for path in sorted(find_shipped().glob("*.safetensors"), key=lambda path: path.stem):
-        method = "mmgsd" if path.stem == name else path.stem.removeprefix(f"{name}-")
-        if method == path.stem:
-            continue
-        matcher = Matcher.load(path)
-        if matcher.config.object == name:
-            matchers[get_label(method, short=True)] = matcher
-    return matchers
+    """{label: matcher} of the models in data/weights that are of the object."""
+    files = {method: find_shipped() / f"{name}{ending}.safetensors" for method, ending in SHIPPED.items()}
+    return {get_label(method, short=True): Matcher.load(file) for method, file in files.items() if file.is_file()}
 
 
 def _find_dataset(name: str, preset: str) -> Path:

@@ -15,13 +15,12 @@ import torch
 
 from mmgsd.command import run_command
 from mmgsd.config import OBJECTS, Paths, TrainConfig, find_root, load_preset
-from mmgsd.experiments import configure_model
+from mmgsd.experiments import SHIPPED, configure_model
 from mmgsd.files import DamagedFileError, ForeignFileError, locked, set_aside, write_bytes, write_text
 from mmgsd.learn.checkpoints import WEIGHTS, load_metadata, read_config, read_tensors, write_tensors
 from mmgsd.measure.evaluation import read_results
 from mmgsd.measure.shipped import RESULTS, SETS
 
-SHIPPED = {"shipped": "", "mmgsd": "-paper", "spcl": "-spcl"}  # row of `MODELS`: what its files' names end with
 CARD = """# {title}
 
 Descriptors of the method `{method}` for a {object}, symmetry group `{group}`; `mmgsd.load("{name}")`.

@@ -307,9 +307,9 @@ def test_nothing_to_explore_is_refused() -> None:
 @pytest.mark.parametrize("name", ["cloth", "rope"])
 def test_every_shipped_model_of_the_object_is_offered(name: str) -> None:
     shipped = load_shipped(name)
-    assert list(shipped) == ["MMGSD", "SPCL"]
+    assert list(shipped) == ["MMGSD, shipped", "MMGSD", "SPCL"]
     assert {matcher.config.object for matcher in shipped.values()} == {name}
-    assert list(load_matchers(name))[:2] == ["MMGSD", "SPCL"] and "SIFT" in load_matchers(name)
+    assert list(load_matchers(name))[:3] == list(shipped) and "SIFT" in load_matchers(name)
 
 
 @pytest.mark.parametrize(

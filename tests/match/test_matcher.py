@@ -269,9 +269,9 @@ def test_cropped_images_are_answered_about_as_well_as_whole_ones(
 
 
 def measure_sample(name: str, size: tuple[int, int]) -> float:
-    """Mean RMSE (px) of the shipped model about sample images, each cropped to at most ``size`` around the object."""
+    """Mean RMSE (px) of a shipped model about sample images, each cropped to at most ``size`` around the object."""
     data, pair_errors = load_dataset(ROOT / "data" / "sample" / name, "test"), []
-    matcher, points, group = load(name, device="cpu"), np.arange(0, 625, 25), data.group()
+    matcher, points, group = load(f"{name}-paper", device="cpu"), np.arange(0, 625, 25), data.group()
     size = np.minimum(size, data.size)
     centres = [np.ptp(xy[seen], 0) / 2 + xy[seen].min(0) for xy, seen in zip(data.xy, data.visible, strict=True)]
     corners = [np.clip(c - size / 2, 0, np.array(data.size) - size).astype(int) for c in centres]

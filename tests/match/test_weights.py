@@ -151,7 +151,7 @@ def test_a_file_that_may_not_be_read(matcher: Matcher, tmp_path: Path, monkeypat
         Matcher.load(path)
 
 
-@pytest.mark.parametrize("name", ["cloth", "rope", "cloth-spcl", "rope-spcl"])
+@pytest.mark.parametrize("name", ["cloth", "rope", "cloth-paper", "rope-paper", "cloth-spcl", "rope-spcl"])
 def test_the_shipped_weights_load(name: str) -> None:
     matcher = load(name, device="cpu")
     assert matcher.object == matcher.config.object == name.split("-")[0]
