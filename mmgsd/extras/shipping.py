@@ -18,6 +18,7 @@ from mmgsd.config import OBJECTS, Paths, TrainConfig, find_root, load_preset
 from mmgsd.experiments import SHIPPED, configure_model
 from mmgsd.files import DamagedFileError, ForeignFileError, locked, set_aside, write_bytes, write_text
 from mmgsd.learn.checkpoints import WEIGHTS, load_metadata, read_config, read_tensors, write_tensors
+from mmgsd.measure.calibration import calibrate_weights
 from mmgsd.measure.evaluation import read_results
 from mmgsd.measure.shipped import RESULTS, SETS
 
@@ -155,6 +156,8 @@ def main() -> None:
         if not weights.is_file() or not (measured or method == "shipped"):  # these are measured as they are shipped
             print(f"{name} {method}: not trained and evaluated yet")
             continue
+        if paths.dataset(name).is_dir():  # elsewhere trained weights are shipped as they came
+            calibrate_weights(weights, paths.dataset(name))
         facts = {"preset": args.preset, "data_seed": config.render[name].seed, "measured": measured}
         print(ship_model(weights, shipped[name, method], facts))
 
