@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import ctypes
 import os
 import re
 import shutil
@@ -67,7 +68,7 @@ def running(command: list[str], log: Path, environment: Mapping[str, str]) -> It
     with open(log, "wb") as file:
         process = subprocess.Popen(
             command, stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT, env=environment,
-            start_new_session=True,
+            start_new_session=True, preexec_fn=_end_with_parent if sys.platform == "linux" else None,
         )  # fmt: skip
     try:
         yield process
@@ -75,6 +76,11 @@ def running(command: list[str], log: Path, environment: Mapping[str, str]) -> It
         if process.poll() is None:
             end_tree(process.pid)
             process.wait()
+
+
+def _end_with_parent() -> None:
+    """In a process that begins: be ended when its parent is killed outright."""
+    ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG
 
 
 def end_tree(pid: int) -> None:
@@ -100,7 +106,8 @@ class Screen:
     def show_state(self, paths: Paths, begun: float) -> None:
         """Tell how far a run is that began at a time (s since 1970)."""
         state = load_state(paths)
-        if state.get("started", 0.0) < begun:  # of an earlier run
+        if state.get("started", 0.0) < begun:  # what an earlier run left
+            self.draw(f"starting: {_say((time.time() - begun) / 60)}", "starting")
             return
         for name in state["minutes"]:
             if name not in self.told:

@@ -15,7 +15,7 @@ from typing import Any
 
 from mmgsd.config import Paths
 from mmgsd.files import DamagedFileError, locked, set_aside, write_json
-from mmgsd.report.results import read_table
+from mmgsd.report.results import REMEDY, read_table
 
 
 def find_run(paths: Paths) -> Path:
@@ -84,9 +84,12 @@ def load_state(paths: Paths) -> dict[str, Any]:
 
 
 def load_minutes(paths: Paths) -> dict[str, float]:
-    """The stored minutes of each stage, {} where there are none."""
+    """The stored minutes of each stage, {} where there are none; DamagedFileError where one is no number."""
     path = paths.results / "stages.json"
-    return read_table(path) if path.is_file() else {}
+    minutes = read_table(path) if path.is_file() else {}
+    if not all(isinstance(value, int | float) for value in minutes.values()):
+        raise DamagedFileError(f"{path} must hold the minutes of each stage: {REMEDY}")
+    return minutes
 
 
 def estimate_left(state: Mapping[str, Any], stored: Mapping[str, float], elapsed: float) -> float | None:

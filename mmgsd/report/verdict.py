@@ -129,7 +129,8 @@ def compare_numbers(stored: Mapping[str, Any], found: Mapping[str, Any], paths: 
         said = judge_number(before, now, tolerance) if _is_made(found, key, paths) or now is None else NOT_RUN
         rows[key] = {"stored": before, "this run": now, "tolerance": tolerance, "agrees": said}
     index = pd.MultiIndex.from_tuples(rows, names=["table", "object", "row", "measure"]) if rows else None
-    return pd.DataFrame(list(rows.values()), index, ["stored", "this run", "tolerance", "agrees"])
+    table = pd.DataFrame(list(rows.values()), index, ["stored", "this run", "tolerance", "agrees"])
+    return table.astype({"stored": float, "this run": float, "tolerance": float})
 
 
 def judge_number(stored: float | None, found: float | None, tolerance: float) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from mmgsd.config import Paths
-from mmgsd.files import LockedError
+from mmgsd.files import DamagedFileError, LockedError
 from mmgsd.report import stages
 from mmgsd.report.stages import Run, estimate_left, find_run, load_minutes, load_state
 
@@ -115,6 +115,13 @@ def test_a_damaged_state_is_set_aside(paths: Paths) -> None:
     (find_run(paths) / "run.json").write_text('{"stages": [')
     with pytest.warns(UserWarning, match="run.json is damaged"):
         assert load_state(paths) == {}
+
+
+def test_stored_minutes_that_are_none_stop_a_run_at_its_beginning(paths: Paths) -> None:
+    paths.results.mkdir(parents=True)
+    (paths.results / "stages.json").write_text('{"01_render": "long"}')
+    with pytest.raises(DamagedFileError, match="stages.json must hold the minutes"):
+        Run(paths, STAGES)
 
 
 def test_only_one_run_of_a_preset_is_at_work(paths: Paths) -> None:
