@@ -38,12 +38,10 @@ help: ## List the targets
 	@grep -hE '^[.a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | awk -F'\t' '{ printf "  make %-15s %s\n", $$1, $$2 }'
 
 reproduce: $(STAMP) ## Run the whole experiment, preset quick: render, train, evaluate, draw
-	@mkdir -p data/generated
-	$(PAPERMILL) notebooks/run_all.ipynb data/generated/run_all_quick.ipynb -p preset quick
+	$(PY) -m mmgsd.report.reproduce quick
 
 smoke: $(STAMP) ## The same with the preset smoke: every stage, tiny
-	@mkdir -p data/generated
-	$(PAPERMILL) notebooks/run_all.ipynb data/generated/run_all_smoke.ipynb -p preset smoke
+	$(PY) -m mmgsd.report.reproduce smoke
 
 test: lint unit notebooks-test ## Every check: lint, unit and notebooks-test
 

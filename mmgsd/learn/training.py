@@ -17,7 +17,6 @@ import torch
 from torch import Tensor
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torch.utils import deterministic
-from tqdm.auto import tqdm
 
 from mmgsd.checks import read_count, read_flag
 from mmgsd.config import CONTRASTIVE, DETAILED, MATCHES_OF_ONE, PASSES, TrainConfig
@@ -44,6 +43,7 @@ from mmgsd.learn.prototypes import compute_prototype_loss, make_prototypes
 from mmgsd.match.matcher import Matcher, load
 from mmgsd.measure.calibration import calibrate_bandwidth, calibrate_modes, calibrate_temperature
 from mmgsd.measure.questions import measure_rmse
+from mmgsd.progress import ProgressBar
 
 PROTOTYPE_EVERY = 4  # each step asks every so many material points
 CHECKPOINT_SECONDS = 60.0  # of training between two checkpoints
@@ -96,7 +96,7 @@ def train_model(
         team.wait()
         run.resume()
         shown = progress and team.rank == 0
-        bar = tqdm(range(run.step, config.steps), desc=config.name, disable=not shown, leave=False)
+        bar = ProgressBar(range(run.step, config.steps), desc=config.name, disable=not shown, leave=False)
         with saying_what_stays(run.describe_kept):
             for _ in bar:
                 bar.set_postfix(loss=f"{run.advance():.3f}", refresh=False)

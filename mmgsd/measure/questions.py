@@ -8,7 +8,6 @@ import numpy as np
 import pandas as pd
 import torch
 from torch import Tensor
-from tqdm.auto import tqdm
 
 from mmgsd.config import EvaluateConfig
 from mmgsd.dataset import Dataset, sample_pairs
@@ -17,6 +16,7 @@ from mmgsd.learn.network import compute_cell_centres
 from mmgsd.match.matcher import Matcher, read_heatmap
 from mmgsd.match.mixture import Mixture
 from mmgsd.measure.metrics import LISTS, compute_mode_lists, compute_query_errors
+from mmgsd.progress import ProgressBar
 
 Answer = Callable[[int, int, np.ndarray, np.ndarray], tuple[Mixture, Tensor]]
 
@@ -40,7 +40,8 @@ def ask(
     orbits = [symmetry.distinct_modes(int(p)) for p in points]
     count = np.array([len(o) for o in orbits])
     frames = []
-    for pair, (first, second) in enumerate(tqdm(pairs, desc=f"evaluate {name}", disable=not progress, leave=False)):
+    bar = ProgressBar(pairs, desc=f"evaluate {name}", disable=not progress, leave=False)
+    for pair, (first, second) in enumerate(bar):
         fit, entropy = answer(first, second, data.xy[first, points], count.clip(min=modes))
         frame = pd.DataFrame({"pair": pair, "image0": first, "image1": second, "point": points})
         frame = frame.assign(visible=data.visible[first, points], n=count, entropy=entropy.cpu().numpy())

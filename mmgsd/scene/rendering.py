@@ -25,7 +25,6 @@ import numpy as np
 import pandas as pd
 from dask.distributed import Client, LocalCluster, as_completed
 from dask.system import cpu_count
-from tqdm.auto import tqdm
 
 from mmgsd.checks import read_count, read_flag
 from mmgsd.config import (
@@ -54,6 +53,7 @@ from mmgsd.files import (
     write_bytes,
     write_json,
 )
+from mmgsd.progress import ProgressBar
 from mmgsd.scene.sheet import Sheet, load_sheet
 from mmgsd.symmetry import GRID_GROUPS, LINE_GROUPS, load_group, load_mirror
 
@@ -246,7 +246,7 @@ def _render_batches(client: Client, jobs: dict, partial: Path, config: RenderCon
     futures = {client.submit(render_batch, job, pure=False, retries=2): name for name, job in jobs.items()}
     total = sum(n for job in jobs.values() for _, n in job["episodes"])
     try:
-        with tqdm(total=total, desc=f"render {config.object}", unit="image", disable=not progress) as bar:
+        with ProgressBar(total=total, desc=f"render {config.object}", unit="image", disable=not progress) as bar:
             for future in as_completed(list(futures)):
                 name = futures.pop(future)
                 write_bytes(partial / f"{name}.zip", future.result())
