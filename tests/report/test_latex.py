@@ -265,7 +265,7 @@ def test_a_preset_that_does_not_exist_is_refused(tmp_path: Path) -> None:
 def test_places_are_means_over_visible_queries(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     points = np.arange(625)
     queries = pd.DataFrame({"point": points, "visible": points != 312, "rmse_px": np.abs(points - 312.0)})
-    data = FigureData({"mmgsd": summarise_errors(queries)}, 1.0, {}, np.zeros((4, 2)))
+    data = FigureData({"mmgsd": summarise_errors(queries)}, 1.0, {}, [np.zeros((4, 2))])
     monkeypatch.setattr("mmgsd.measure.figure_data.load_figure_data", lambda path: data)
     rope = measure_places(tmp_path / "figures_rope.safetensors", "rope")
     assert rope["end"] > 250 and rope["middle"] == pytest.approx(31.5, abs=1)  # 1 to 62, without the hidden one
