@@ -100,9 +100,9 @@ MODELS = (
     Model("unimodal", "Unimodal", PRESET, {"method": "unimodal"}, FOUR, colour="#009E73"),
     Model("pcl", "PCL", PRESET, {"method": "pcl", "margin": 4.0}, FOUR, colour="#56B4E9"),
     # what the symmetry group decides
-    Model("v4", "`v4`, the flips", "mmgsd", {"group": "v4"}, ("symmetry",), objects=("cloth",)),
-    Model("c4", "`c4`, the rotations", "mmgsd", {"group": "c4"}, ("symmetry",), objects=("cloth",)),
-    Model("d4", "`d4`, all eight", "mmgsd", {"group": "d4"}, ("symmetry",), objects=("cloth",)),
+    Model("v4", "`v4`, the flips", "mmgsd", {"group": "v4"}, ("symmetry",), "", "#9A78C7", ("cloth",)),
+    Model("c4", "`c4`, the rotations", "mmgsd", {"group": "c4"}, ("symmetry",), "", "#6F42A6", ("cloth",)),
+    Model("d4", "`d4`, all eight", "mmgsd", {"group": "d4"}, ("symmetry",), "", "#3E1C6B", ("cloth",)),
     # prior work's ways to break the symmetry, each after the images without it
     Model("any rotation", "cloth, any rotation", "pcl", {"group": "identity"}, ("fixes",), objects=("cloth",)),
     Model("±45° only", "cloth, ±45° only", "any rotation", {"rotate": False}, ("fixes",), objects=("cloth",),

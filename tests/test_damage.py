@@ -144,7 +144,7 @@ def use_figure_data(folder: Path, damage: Callable[[bytes], bytes], dataset: Pat
     answer = Match(image, image, xy, np.ones((1, 4, 2)), np.ones((1, 4)), np.ones((1, 4, 2, 2)), np.zeros(1),
                    np.zeros(1), np.ones((1, 5, 5), np.float32))  # fmt: skip
     errors = ErrorSummary(np.ones(3), np.ones(3), np.ones(4))
-    path = save_figure_data(FigureData({"mmgsd": errors}, 1.0, {"mmgsd": answer}, xy), folder / "figures.safetensors")
+    path = save_figure_data(FigureData({"mmgsd": errors}, 1.0, {"mmgsd": answer}, [xy]), folder / "figures.safetensors")
     path.write_bytes(damage(path.read_bytes()))
     load_figure_data(path)
 

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from scipy.ndimage import distance_transform_cdt
 
 from mmgsd.dataset import Dataset
+from mmgsd.experiments import get_colour
 from mmgsd.figures.style import (
     PAGE_IN,
     blend_heatmap,
@@ -20,12 +21,12 @@ from mmgsd.figures.style import (
     finish_axes,
     make_grid,
     mark_pixel,
+    mark_true,
     styled,
 )
 from mmgsd.match.match import Match
 
 FEW_PAIRS = 5  # of images: their mean says as much of them as of their states
-TRUE = "#00FF6A"  # the sign of true matches
 QUESTIONS = {
     "hidden": ("hidden\nmatches", [0, 1, 2, 3, 4, 5]),
     "seen_target": ("visible share\nof target", [0, 0.4, 0.6, 0.8, 0.95, 1.01]),
@@ -100,7 +101,7 @@ def _draw_states(axis: Axes, table: pd.DataFrame, name: str) -> None:
 def _draw_bins(axis: Axes, table: pd.DataFrame, column: str, edges: Sequence[float]) -> None:
     groups = table.groupby(pd.cut(table[column], edges, right=False), observed=True).rmse_px
     means, shares = groups.mean(), groups.size() / len(table)
-    axis.bar(range(len(means)), means, color="#D55E00", width=0.75)
+    axis.bar(range(len(means)), means, color=get_colour("mmgsd"), width=0.75)
     for k, share in enumerate(shares):
         axis.text(k, 0, f" {100 * share:.0f} %", ha="center", va="bottom", fontsize=5.5, c="w", rotation=90)
     whole = all(float(e).is_integer() for e in edges)
@@ -134,7 +135,7 @@ def plot_worst(matches: Sequence[Match], true: Sequence[np.ndarray], errors_px: 
         axis.set(xlim=(-0.5 - left, width - 0.5), ylim=(height - 0.5, -0.5))
         mark_pixel(axis, match.xy[0, 0] - left, match.xy[0, 1])
         draw_modes(axis, match, 0)
-        axis.scatter(*np.transpose(xy), s=22, marker="+", c=TRUE, linewidths=1.0, zorder=3)
+        mark_true(axis, xy)
         axis.set_title(f"{error:.0f} px", fontsize=6)
     for axis in axes.flat[len(matches) :]:
         axis.remove()

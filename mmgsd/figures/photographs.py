@@ -8,12 +8,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from mmgsd.figures.plots import shrink_match
-from mmgsd.figures.style import PAGE_IN, check_filled, make_grid, show_answer, show_source, styled
+from mmgsd.figures.style import PAGE_IN, check_filled, make_grid, mark_true, show_answer, show_source, styled
 from mmgsd.match.match import Match
 from mmgsd.measure.photographs import Photograph
 
 COLUMNS = 6  # three photographs a row, each beside what it was asked from
-TRUE = "#8CFF4A"
 MOST = 60  # photographs on one sheet
 
 
@@ -43,6 +42,6 @@ class ContactSheet:
         for (path, (match, xy)), (source, answer) in zip(self._panels.items(), axes.reshape(-1, 2), strict=False):
             show_source(source, match, 0)
             show_answer(answer, match, 0)
-            answer.scatter(*xy.T, s=16, marker="+", c=TRUE, linewidths=1.0)
+            mark_true(answer, xy)
             source.set_title(path.name, loc="left")
         return figure

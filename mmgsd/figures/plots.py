@@ -22,14 +22,13 @@ from mmgsd.figures.style import (
     MARK,
     PAGE_IN,
     add_legend,
-    blend_heatmap,
     check_filled,
     compute_point_colours,
     fade_image,
     finish_axes,
     get_line_style,
     make_grid,
-    mark_pixel,
+    name_grid,
     show_answer,
     show_source,
     styled,
@@ -40,6 +39,7 @@ from mmgsd.measure.metrics import BIN_PX, ErrorSummary
 
 _ORBIT_COLOURS = ("#D55E00", "#56B4E9", "#FFE100", "#009E73")
 SEGMENTS = 25  # of a rope
+MOST_MODES = 8  # of a material point under any group
 PAGE_QUERIES, PANEL_PX = 100, 640  # on one page at most; the longer side of an image in a panel of it
 
 
@@ -103,55 +103,6 @@ def shrink_match(match: Match) -> Match:
 
 
 @styled
-def plot_teaser(matches: Mapping[str, Sequence[Match]]) -> Figure:
-    """A row an object ({object: matches}): source, target, and heatmap with modes of each match's first query."""
-    check_filled("matches", matches)
-    blocks = max(len(row) for row in matches.values())
-    aspects = [_get_aspect(row[0]) for row in matches.values()]
-    figure, axes = make_grid(aspects, 3 * blocks, COLUMN_IN if blocks == 1 else PAGE_IN)
-    for line, (name, row) in zip(axes, matches.items(), strict=True):
-        line[0].set_ylabel(name.capitalize())
-        for block, match in enumerate(row):
-            source, target, answer = line[3 * block : 3 * block + 3]
-            show_source(source, match, 0)
-            target.imshow(match.image1)
-            show_answer(answer, match, 0)
-    for column, axis in enumerate(axes[0]):
-        axis.set_title(("Source", "Target", "Matches")[column % 3])
-    return figure
-
-
-@styled
-def plot_combined(
-    answers: Mapping[str, Mapping[str, Match]], true: Mapping[str, np.ndarray], inwards: Mapping[str, Match],
-    *, sigma_px: float = 10.0,
-) -> Figure:  # fmt: skip
-    """A: contrastive answers, B: the true and MMGSD's distribution of the same query, C: queries moved inwards.
-
-    ``answers`` {object: {"pcl", "spcl", "mmgsd": match}}, first query of each, contrastive ones where they are
-    trained; ``true`` {object: (n, 2) px}, drawn as Gaussians of ``sigma_px``, wide enough to be seen; ``inwards``
-    {object: match of four queries, extremity first}.
-    """
-    check_filled("answers", answers)
-    for name, match in inwards.items():
-        if len(match.xy) != 4:
-            raise ValueError(f"inwards[{name!r}] must hold 4 queries, got {len(match.xy)}")
-    aspects = [_get_aspect(m["mmgsd"]) for m in answers.values()] + [_get_aspect(m) for m in inwards.values()]
-    figure, axes = make_grid(aspects, 5, PAGE_IN)
-    for line, (name, methods) in zip(axes, answers.items(), strict=False):
-        _draw_comparison(line, methods, true[name], sigma_px)
-        line[0].set_ylabel(name.capitalize())
-    for line, (name, match) in zip(axes[len(answers) :], inwards.items(), strict=True):
-        _draw_inwards(line, match)
-        line[0].set_ylabel(name.capitalize())
-    for axis, title in zip(axes[0], (r"$\bf{A}$  Source", "PCL", "SPCL", r"$\bf{B}$  True", "MMGSD"), strict=True):
-        axis.set_title(title)
-    if inwards:
-        axes[len(answers), 0].set_title(r"$\bf{C}$  Sources 1–4")
-    return figure
-
-
-@styled
 def plot_rmse_pdf(errors: Mapping[str, Mapping[str, ErrorSummary]], object_sizes_px: Mapping[str, float]) -> Figure:
     """Probability density of the error of a query with a visible source, as a percentage of the object's size.
 
@@ -197,8 +148,8 @@ def plot_spatial_rmse(
     maps = [errors["cloth"][method].mean_px.reshape(25, 25) for method in mapped]
     for axis, method, values in zip(axes[1:], mapped, maps, strict=True):
         image = axis.imshow(values, cmap=colormaps["viridis"].with_extremes(bad="0.85"), vmin=0, vmax=np.nanmax(maps))
-        axis.set(title=f"Cloth · {get_label(method, short=True)}", xticks=[0, 12, 24], yticks=[0, 12, 24])
-    axes[1].set(xlabel="Column of the grid", ylabel="Row of the grid")
+        axis.set_title(f"Cloth · {get_label(method, short=True)}")
+    name_grid(axes[1:])
     figure.colorbar(image, ax=axes[1:], label="RMSE (px)", shrink=0.8)
     add_legend(figure, axes[:1])
     return finish_axes(figure, keep_box=axes[1:])
@@ -218,7 +169,7 @@ def plot_sigma_ablation(results: Mapping[str, Mapping[str, Mapping[str, float]]]
             axis.annotate(f"{y:.1f}", (x, y), xytext=(0, 4), textcoords="offset points", ha="center", fontsize=6.5)
         axis.set_xscale("log", base=2)
         axis.set_xticks(sigma, [f"{s:g}" for s in sigma])
-        axis.set(title=name.capitalize(), xlabel="Std σ of a target mode (px)", ylim=(0, 1.2 * max(error)))
+        axis.set(title=name.capitalize(), xlabel="σ of the targets (px)", ylim=(0, 1.2 * max(error)))
         axis.margins(x=0.15)
     axes[0, 0].set_ylabel("RMSE of MMGSD (px)")
     return finish_axes(figure)
@@ -319,12 +270,21 @@ def plot_variety(tables: Mapping[str, pd.DataFrame], modes: Mapping[str, Mapping
         line[1].hist(100 * table.visible, np.arange(0, 101, 5), color="0.5")
         line[1].set(xlabel="Visible material points (%)", ylabel="Images", xlim=(0, 100))
         _draw_hues(line[2], table)
-        counts = pd.DataFrame({g: pd.Series(m).value_counts() for g, m in modes[name].items()}).sort_index()
-        counts.T.plot.bar(stacked=True, ax=line[3], colormap="viridis", width=0.7, rot=0)
-        line[3].set(ylabel="Material points", xlabel="")
-        line[3].tick_params("x", rotation=45)
-        line[3].legend(title="Modes", loc="center left", bbox_to_anchor=(1, 0.5), fontsize=6, title_fontsize=6)
+        _draw_modes_a_point(line[3], modes[name])
     return finish_axes(figure)
+
+
+def _draw_modes_a_point(axis: Axes, groups: Mapping[str, Sequence[int]]) -> None:
+    """Material points by how many modes they have, a bar a group; a number of modes has one colour for all objects."""
+    counts = pd.DataFrame({group: pd.Series(modes).value_counts() for group, modes in groups.items()}).sort_index()
+    bottom = np.zeros(counts.shape[1])
+    for n, row in counts.fillna(0).iterrows():
+        colour = colormaps["viridis"](np.log2(n) / np.log2(MOST_MODES))
+        axis.bar(counts.columns, row, 0.7, bottom, color=colour, label=n)
+        bottom += row.to_numpy()
+    axis.set(ylabel="Material points", xlabel="Symmetry group", xlim=(-0.6, counts.shape[1] - 0.4))
+    axis.set_xticks(range(counts.shape[1]), counts.columns, rotation=40, ha="right", rotation_mode="anchor")
+    axis.legend(title="Modes", loc="center left", bbox_to_anchor=(1, 0.5), fontsize=6, title_fontsize=6)
 
 
 def _draw_hues(axis: Axes, table: pd.DataFrame) -> None:
@@ -337,8 +297,11 @@ def _draw_hues(axis: Axes, table: pd.DataFrame) -> None:
         colours = hsv_to_rgb(np.stack([edges[:-1] + 1 / 24, np.full(12, 0.65), np.full(12, 0.85)], -1))
         axis.bar(edges[:-1], counts, 1 / 12, align="edge", color=colours)
         axis.bar(-1 / 12, sign * np.sum(~vivid), 1 / 12, align="edge", color="0.6")
+        axis.text(0.98, 0.5 + 0.45 * sign, part, ha="right", va="center", fontsize=6.5, transform=axis.transAxes)
     axis.axhline(0, color="black", lw=0.6)
-    axis.set(xlabel="Hue (left: greys)", ylabel="Background | object", xticks=[])
+    most = max(abs(limit) for limit in axis.get_ylim())
+    axis.set(xlabel="Hue (left: greys)", ylabel="Images", xticks=[], ylim=(-most, most))
+    axis.yaxis.set_major_formatter(lambda count, _: f"{abs(count):g}")  # downwards as many
 
 
 def compute_object_size(masks: Sequence[np.ndarray]) -> float:
@@ -357,31 +320,3 @@ def compute_density(histogram: np.ndarray, step: float, *, bandwidth: float = 1.
     padded = np.pad(histogram, (0, int(np.ceil(5 * bandwidth / step))))
     density = gaussian_filter1d(padded / (padded.sum() * step), bandwidth / step, mode="reflect")
     return (np.arange(len(padded)) + 0.5) * step, density
-
-
-def _draw_comparison(line: Sequence[Axes], methods: Mapping[str, Match], true: np.ndarray, sigma_px: float) -> None:
-    match = methods["mmgsd"]
-    show_source(line[0], match, 0)
-    for axis, method in zip(line[[1, 2, 4]], ("pcl", "spcl", "mmgsd"), strict=True):
-        if method in methods:
-            show_answer(axis, methods[method], 0, modes=False)
-        else:
-            axis.set_axis_off()
-            axis.text(0.5, 0.5, "not trained", ha="center", va="center", fontsize=6, transform=axis.transAxes)
-    ys, xs = np.mgrid[: match.image1.shape[0], : match.image1.shape[1]]
-    mixture = sum(np.exp(-((xs - x) ** 2 + (ys - y) ** 2) / (2 * sigma_px**2)) for x, y in true)
-    line[3].imshow(blend_heatmap(match.image1, mixture))
-
-
-def _draw_inwards(line: Sequence[Axes], match: Match) -> None:
-    line[0].imshow(match.image0)
-    for index, (x, y) in enumerate(match.xy):
-        mark_pixel(line[0], x, y)
-        line[0].annotate(str(index + 1), (x, y), xytext=(3, 3), textcoords="offset points", color="black",
-                         bbox={"boxstyle": "circle,pad=0.1", "fc": MARK, "lw": 0}, fontsize=5.5)  # fmt: skip
-        show_answer(line[index + 1], match, index, modes=False)
-        line[index + 1].set_title(f"{index + 1} · {match.entropy[index]:.1f} nats")
-
-
-def _get_aspect(match: Match) -> float:
-    return match.image1.shape[0] / match.image1.shape[1]

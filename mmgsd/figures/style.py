@@ -28,6 +28,7 @@ from mmgsd.match.match import Match
 CHANCE_STYLES = {"centre": "--", "random": ":"}
 COLUMN_IN, PAGE_IN = 3.5, 7.1  # widths of a column and of a page
 MARK = "#FFE100"  # the asked pixel
+TRUE = "#00FF6A"  # the sign of true matches
 
 HEAT = colormaps["inferno"](np.linspace(0.3, 1, 256))[:, :3].astype(np.float32)  # from cold to hot
 FAINT = 0.35  # opacity of modes where there is no answer
@@ -109,6 +110,11 @@ def mark_pixel(axis: Axes, x: float, y: float) -> None:
     axis.scatter(x, y, s=22, facecolors=MARK, edgecolors="black", linewidths=0.8, zorder=3)
 
 
+def mark_true(axis: Axes, xy: np.ndarray) -> None:
+    """Crosses at true matches (n, 2) px."""
+    axis.scatter(*np.transpose(xy), s=22, marker="+", c=TRUE, linewidths=1.0, zorder=3)
+
+
 def blend_heatmap(image: np.ndarray, heatmap: np.ndarray) -> np.ndarray:
     """(H, W, 3) uint8: the faded image under the (H, W) heatmap, which is widened a little so as to be seen."""
     strength = compute_strength(heatmap)
@@ -152,9 +158,17 @@ def make_grid(aspects: Sequence[float], columns: int, width: float) -> tuple[Fig
 
 
 def add_legend(figure: Figure, axes: Sequence[Axes]) -> None:
-    """One legend below the figure for all lines of the axes."""
+    """One legend for all lines of the axes, below the figure and at a distance from the axes' labels."""
+    figure.get_layout_engine().set(h_pad=0.06)
     entries = {label: line for axis in axes for line, label in zip(*axis.get_legend_handles_labels(), strict=True)}
     figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=4, handlelength=1.6)
+
+
+def name_grid(axes: Sequence[Axes]) -> None:
+    """Ticks and names of maps over the cloth's 25 × 25 material points, in a row."""
+    for axis in axes:
+        axis.set(xticks=[0, 12, 24], yticks=[0, 12, 24], xlabel="Column of the grid")
+    axes[0].set_ylabel("Row of the grid")
 
 
 def finish_axes(figure: Figure, *, keep_box: Sequence[Axes] = ()) -> Figure:

@@ -106,7 +106,6 @@ def _make_panels(name: str, tables: Tables) -> tuple[Figure, np.ndarray]:
 
 def _make_row(count: int) -> tuple[Figure, np.ndarray]:
     figure, axes = plt.subplots(1, count, figsize=(COLUMN_IN, 2.2), layout="constrained", squeeze=False)
-    figure.get_layout_engine().set(h_pad=0.04)  # the legend keeps its distance from the axes' labels
     return figure, axes[0]
 
 

@@ -26,7 +26,7 @@ HAND_MADE = ("sift", "surf", "orb")  # that the paper names; SURF is not in the 
 
 @dataclass(frozen=True)
 class Claim:
-    """One claim; texts are LaTeX, ``key`` is what the report asks its verdict by."""
+    """One claim; texts are Markdown, ``key`` is what the report asks its verdict by."""
 
     key: str
     claim: str
@@ -81,7 +81,7 @@ def judge_rmse(results: Mapping[str, Any]) -> Claim:
     """The paper's headline errors."""
     errors = {name: get(results, "rmse", name, "mmgsd", "rmse_mean") for name in OBJECTS}
     parts = tuple(is_at_least(PAPER[name], errors[name]) for name in OBJECTS)
-    claim = " and ".join(f"{PAPER[name]}~px on {name}" for name in OBJECTS)
+    claim = " and ".join(f"{PAPER[name]} px on {name}" for name in OBJECTS)
     return Claim("rmse", f"MMGSD's error is {claim}.", "Ours is no larger; a part each object.", _list(errors), parts)
 
 
@@ -95,7 +95,7 @@ def judge_improvement(results: Mapping[str, Any]) -> Claim:
     others = {"SPCL with dense supervision": dense, "SPCL, both at the studies' budget": equal}
     beside = "".join(f"; below {other}: {_list_gains(row)}" for other, row in others.items() if any(row.values()))
     return Claim(
-        "improvement", rf"MMGSD's error is {100 * IMPROVEMENT:.1f}\,\% below SPCL's on average.",
+        "improvement", f"MMGSD's error is {100 * IMPROVEMENT:.1f} % below SPCL's on average.",
         "MMGSD is better, a part each object; the mean of the two improvements is as large, a part.",
         f"{_list_gains(gains)}, mean {_say(mean, 'percent')}{beside}", parts,
     )  # fmt: skip
@@ -107,7 +107,7 @@ def judge_sigma(results: Mapping[str, Any]) -> Claim:
     parts = tuple(is_better(row.get("1"), row[s]) for row in errors.values() for s in row if float(s) > 1) or (None,)
     shown = [f"{n}: " + ", ".join(f"{_say(e)} at {s}" for s, e in row.items()) for n, row in errors.items()]
     return Claim(
-        "sigma", r"A target of $\sigma = 1$~px is best; every wider one is worse.",
+        "sigma", "A target of σ = 1 px is best; every wider one is worse.",
         "The wider target's error is larger; a part each object and width.", "; ".join(shown), parts,
     )  # fmt: skip
 
@@ -131,7 +131,7 @@ def judge_hand_made(results: Mapping[str, Any]) -> Claim:
     shown = [f"{m.upper()} {' / '.join(_say(v, 'percent') for v in row.values())}" for m, row in shares.items()]
     return Claim(
         "hand-made", "SIFT, SURF and ORB fail.",
-        rf"They find fewer than {100 * FOUND:.0f}\,\% of the matches within 20~px; a part each method and object.",
+        f"They find fewer than {100 * FOUND:.0f} % of the matches within 20 px; a part each method and object.",
         f"found, cloth / rope: {', '.join(shown)}", parts,
     )  # fmt: skip
 
@@ -140,11 +140,11 @@ def judge_rotation_limit(results: Mapping[str, Any]) -> Claim:
     """The first fix of prior work; its errors are not kept by angle, so the cause stays open."""
     free, limited = (get(results, "broken_symmetry", f"cloth, {fix}") for fix in ("any rotation", "±45° only"))
     share = get(limited, "pck@20px")
-    errors = {"any rotation": get(free, "rmse_mean"), r"$\pm 45^\circ$": get(limited, "rmse_mean")}
+    errors = {"any rotation": get(free, "rmse_mean"), "±45°": get(limited, "rmse_mean")}
     return Claim(
-        "rotation-limit", r"PCL still suffers where the cloth turns by no more than $\pm 45^\circ$.",
+        "rotation-limit", "PCL still suffers where the cloth turns by no more than ±45°.",
         "Limited, PCL fails by the rule for SIFT, a part; its errors gather at the range's ends, a part not measured.",
-        f"{_list(errors)}; limited, {_say(share, 'percent')} found within 20~px", (fails(share), None),
+        f"{_list(errors)}; limited, {_say(share, 'percent')} found within 20 px", (fails(share), None),
     )  # fmt: skip
 
 
@@ -157,7 +157,7 @@ def judge_ball(results: Mapping[str, Any]) -> Claim:
     return Claim(
         "ball", "A ball at one end of the rope breaks its symmetry.",
         "PCL's error is lower with the ball, a part; it takes the right one of the two matches in "
-        rf"{100 * CHOSEN:.0f}\,\% of its answers or more, a part.",
+        f"{100 * CHOSEN:.0f} % of its answers or more, a part.",
         f"{_list(errors)}; right {', '.join(_say(share, 'percent') for share in right.values())}",
         (is_better(errors["with a ball"], errors["plain"]), chosen),
     )  # fmt: skip
@@ -182,7 +182,7 @@ def judge_inward(results: Mapping[str, Any]) -> Claim:
     shown = ", ".join(f"{region} {_say(value, 'share')}" for region, value in nats.items())
     return Claim(
         "inward", "Uncertainty is least at the extremities and grows inwards and at knots.",
-        rf"The cloth's interior has at least {NATS}~nats more than its corners, a part; knots, a part not measured.",
+        f"The cloth's interior has at least {NATS} nats more than its corners, a part; knots, a part not measured.",
         f"nats: {shown}", parts,
     )  # fmt: skip
 
@@ -193,9 +193,9 @@ def judge_group(results: Mapping[str, Any]) -> Claim:
     worse = {region: is_better(c4.get(region), v4.get(region)) for region in ("corner", "edge", "interior")}
     parts = tuple(None if None in (worse[r], worse["corner"]) else worse[r] and not worse["corner"] for r in PLAIN)
     return Claim(
-        "group", r"Our conjecture: the errors inside are those of the group \texttt{v4}, not of cloth.",
-        r"Edge, or interior, is worse under \texttt{v4} than under \texttt{c4}, the corners are not; a part each.",
-        rf"\texttt{{v4}}: {_list(v4)}; \texttt{{c4}}: {_list(c4)}", parts,
+        "group", "Our conjecture: the errors inside are those of the group `v4`, not of cloth.",
+        "Edge, or interior, is worse under `v4` than under `c4`, the corners are not; a part each.",
+        f"`v4`: {_list(v4)}; `c4`: {_list(c4)}", parts,
     )  # fmt: skip
 
 
@@ -228,7 +228,7 @@ def _is_greatest(errors: Mapping[str, float | None], place: str, others: Sequenc
 
 
 def _list(errors: Mapping[str, float | None]) -> str:
-    return ", ".join(f"{name} {_say(error)}" for name, error in errors.items()) + "~px" if errors else "--"
+    return ", ".join(f"{name} {_say(error)}" for name, error in errors.items()) + " px" if errors else "–"
 
 
 def _list_gains(gains: Mapping[str, float | None]) -> str:
@@ -237,5 +237,5 @@ def _list_gains(gains: Mapping[str, float | None]) -> str:
 
 def _say(value: float | None, kind: str = "px") -> str:
     if value is None:
-        return "--"
-    return {"px": f"{value:.1f}", "percent": rf"{100 * value:.0f}\,\%", "share": f"{value:.2f}"}[kind]
+        return "–"
+    return {"px": f"{value:.1f}", "percent": f"{100 * value:.0f} %", "share": f"{value:.2f}"}[kind]

@@ -1,13 +1,13 @@
-"""What was found, in sentences whose numbers come from the results, and the paper's claims as a Markdown table."""
+"""What was found, in sentences whose numbers come from the results, and the table of the paper's claims."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 from mmgsd.config import OBJECTS
-from mmgsd.report.claims import IMPROVEMENT, get, list_claims
+from mmgsd.report.claims import IMPROVEMENT, NOT_MEASURED, Claim, get, list_claims
+from mmgsd.report.descriptions import Column, Table
 
 DETAIL = "data/results/README.md"  # seen from the README
 FINDINGS = (  # a name, a sentence, the section of the results page that it leads to
@@ -35,10 +35,6 @@ REPEATS = {  # claim: what repeats it, and the models of runs.json that it train
     "inward": ("`08_symmetry_study`", ()),
     "group": ("`08_symmetry_study`", ()),
 }
-MARKDOWN = {
-    r"\\texttt\{(\w+)\}": r"`\1`", r"\$\\sigma = 1\$": "σ = 1", r"\$\\pm 45\^\\circ\$": "±45°", r"\\,\\%": " %",
-    "~": " ", "--": "–",
-}  # fmt: skip
 
 
 def make_findings(results: Mapping[str, Any]) -> str:
@@ -61,14 +57,21 @@ def make_findings(results: Mapping[str, Any]) -> str:
     return "\n".join(f"- {link}{row[1].format(**numbers)}" for link, row in zip(links, FINDINGS, strict=True))
 
 
-def make_claims_table(results: Mapping[str, Any]) -> str:
-    """Markdown of the paper's claims, a row each: verdict, what was measured, what repeats it, minutes of training."""
-    lines = ["| claim | here | measured | repeat it by | minutes |", "|---" * 5 + "|"]
-    for claim in list_claims(results):
-        command, models = REPEATS[claim.key]
-        cells = (claim.claim, f"**{claim.verdict}**", claim.measured, command, sum_minutes(results, claim.key, models))
-        lines.append(f"| {' | '.join(map(to_markdown, cells[:3]))} | {' | '.join(cells[3:])} |")
-    return "\n".join(lines)
+def describe_claims(results: Mapping[str, Any]) -> Table:
+    """The paper's claims: the rule, verdict, what was measured, what repeats it, minutes of training."""
+    columns = [
+        Column("rule", "counts as held where"), Column("verdict", "verdict", "here"),
+        Column("measured", "measured", "measured"), Column("command", page="repeat it by"),
+        Column("minutes", page="minutes"),
+    ]  # fmt: skip
+    return Table("claim", {"": columns}, {claim.claim: {"": _tell(claim, results)} for claim in list_claims(results)})
+
+
+def _tell(claim: Claim, results: Mapping[str, Any]) -> dict[str, str]:
+    command, models = REPEATS[claim.key]
+    measured = "no results for this preset" if claim.verdict == NOT_MEASURED else claim.measured
+    return {"rule": claim.rule, "verdict": f"**{claim.verdict}**", "measured": measured, "command": command,
+            "minutes": sum_minutes(results, claim.key, models)}  # fmt: skip
 
 
 def sum_minutes(results: Mapping[str, Any], key: str, models: Iterable[str]) -> str:
@@ -78,13 +81,6 @@ def sum_minutes(results: Mapping[str, Any], key: str, models: Iterable[str]) -> 
         runs = [row.get("run") for name in OBJECTS for row in (get(results, "sigma", name) or {}).values()]
     known = [run["minutes"] for run in runs if run]
     return f"{sum(known):.0f}" if known else "–"
-
-
-def to_markdown(latex: str) -> str:
-    """A claim's text, which is LaTeX, as Markdown."""
-    for pattern, text in MARKDOWN.items():
-        latex = re.sub(pattern, text, latex)
-    return latex
 
 
 def _format_gains(ours: Iterable[float], theirs: Iterable[float], *, sign: int = 1) -> str:

@@ -19,6 +19,7 @@ from mmgsd.config import IMAGE_SIZE, Paths, find_root, load_preset
 from mmgsd.files import write_text
 from mmgsd.report import latex_tables as tables
 from mmgsd.report.claims import list_claims
+from mmgsd.report.findings import describe_claims
 from mmgsd.report.results import load_results, told_where
 
 Results = Mapping[str, Any]
@@ -35,10 +36,11 @@ def write_report(preset: str, root: Path) -> list[Path]:
         claims = list_claims(results)
         described = dataclasses.asdict(config) | {"image_size": IMAGE_SIZE}
         numbers = {**results, "config": described, "verdict": {claim.key: claim.verdict for claim in claims}}
-        texts = {"results": make_definitions(preset, numbers), "claims_table": tables.make_claims_table(claims)}
+        table = tables.to_latex(describe_claims(results), tables.CLAIMS)
+        texts = {"results": make_definitions(preset, numbers), "claims_table": table}
     for name, (file, make) in tables.TABLES.items():
         with told_where(paths.results / f"{file}.json"):
-            texts[name] = make(results[file]) if file in results else tables.NOT_RUN
+            texts[name] = tables.to_latex(make(results[file])) if file in results else tables.NOT_RUN
     return [write_text(root / "paper" / "generated" / f"{name}.tex", f"{text}\n") for name, text in texts.items()]
 
 

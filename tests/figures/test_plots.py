@@ -8,9 +8,10 @@ import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.figure import Figure
+from matplotlib.patches import ConnectionPatch
 
 from mmgsd.experiments import get_colour
-from mmgsd.figures import plots
+from mmgsd.figures import answers, plots
 from mmgsd.figures import style as drawing
 from mmgsd.match.match import Match
 from mmgsd.measure.metrics import BIN_PX, ErrorSummary, summarise_errors
@@ -115,31 +116,55 @@ def test_a_page_holds_so_many_queries(queries):
 
 
 def test_plot_teaser_has_three_panels_a_match():
-    figure = plots.plot_teaser({"cloth": [make_match(height=60)], "rope": [make_match()]})
+    figure = answers.plot_teaser({"cloth": [make_match(height=60)], "rope": [make_match()]})
     assert len(figure.axes) == 6
     assert figure.get_figwidth() == pytest.approx(drawing.COLUMN_IN)
+
+
+def test_the_teaser_marks_every_match_and_leads_to_it_from_the_pixel():
+    match = make_match(modes=4)
+    match.modes[0, 3] = np.nan
+    figure = answers.plot_teaser({"cloth": [match]})
+    source, target, _ = figure.axes
+    marks = [tuple(mark.get_offsets()[0]) for mark in target.collections]
+    assert marks == [pytest.approx(tuple(mode)) for mode in match.modes[0, :3]]
+    lines = [line for line in figure.artists if isinstance(line, ConnectionPatch)]
+    assert {tuple(line.xy1) for line in lines} == {tuple(match.xy[0])} and len(lines) == 2 * 3  # and their outlines
+    assert len(source.collections) == 1
 
 
 def test_plot_combined_has_five_columns():
     methods = {method: make_match() for method in ("pcl", "spcl", "mmgsd")}
     true = np.array([[10.0, 10.0], [30.0, 20.0]])
-    figure = plots.plot_combined({"rope": methods}, {"rope": true}, {"rope": make_match(4)})
+    figure = answers.plot_combined({"rope": methods}, {"rope": true}, {"rope": make_match(4)})
     assert len(figure.axes) == 10
     shown = figure.axes[3].images[0].get_array()
     assert shown.shape == (40, 60, 3)
     assert shown[10, 10, 0] > 0.9  # the heatmap's brightest colour at a true mode
 
 
+def test_plot_combined_marks_modes_and_true_matches():
+    methods = {method: make_match() for method in ("pcl", "spcl", "mmgsd")}
+    true = np.array([[10.0, 10.0], [30.0, 20.0]])
+    source, *compared, first = answers.plot_combined({"rope": methods}, {"rope": true}, {"rope": make_match(4)}).axes[
+        :6
+    ]
+    assert [len(axis.patches) for axis in compared] == [2, 2, 0, 2]  # an ellipse a mode
+    for axis in compared:
+        np.testing.assert_array_equal(axis.collections[-1].get_offsets(), true)
+    assert [text.get_text() for text in first.texts] == ["1", "2", "3", "4"]
+
+
 def test_plot_combined_says_what_is_not_trained():
     methods = {method: make_match() for method in ("spcl", "mmgsd")}
-    figure = plots.plot_combined({"rope": methods}, {"rope": np.array([[10.0, 10.0]])}, {})
+    figure = answers.plot_combined({"rope": methods}, {"rope": np.array([[10.0, 10.0]])}, {})
     assert [len(axis.images) for axis in figure.axes] == [1, 0, 1, 1, 1]
     assert [text.get_text() for text in figure.axes[1].texts] == ["not trained"]
 
 
 def test_plot_combined_wants_four_queries_inwards():
     with pytest.raises(ValueError, match="must hold 4 queries, got 3"):
-        plots.plot_combined({"rope": {"mmgsd": make_match()}}, {}, {"rope": make_match(3)})
+        answers.plot_combined({"rope": {"mmgsd": make_match()}}, {}, {"rope": make_match(3)})
 
 
 def test_compute_density_is_one_in_all_and_highest_at_the_data():
@@ -236,6 +261,18 @@ def test_plot_variety_counts_states_and_hues():
     assert [bar.get_height() for bar in visible.patches][10] == 1 and visible.patches[19].get_height() == 3
     assert sorted(bar.get_height() for bar in hues.patches if bar.get_height()) == [-4, 1, 3]
     assert [bar.get_height() for bar in modes.patches] == [1, 2]
+    assert {hues.yaxis.get_major_formatter()(count) for count in (-4, 4)} == {"4"}  # downwards are no negative images
+
+
+def test_a_number_of_modes_has_one_colour_for_all_objects():
+    table = pd.DataFrame({"state": ["flat"], "visible": [1.0], "object_colour": [np.zeros(3)],
+                          "background_colour": [np.zeros(3)]})  # fmt: skip
+    groups = {"cloth": {"c4": [4, 4, 1], "d4": [8, 8, 4]}, "rope": {"c2": [2, 2, 1]}}
+    figure = plots.plot_variety(dict.fromkeys(groups, table), groups)
+    cloth, rope = ({text.get_text(): bar.get_facecolor() for bar, text in zip(axis.get_legend().get_patches(),
+                   axis.get_legend().get_texts(), strict=True)} for axis in figure.axes[3::4])  # fmt: skip
+    assert cloth["1"] == rope["1"] and len({*cloth.values(), *rope.values()}) == 4
+    assert list(cloth) == ["1", "4", "8"] and list(rope) == ["1", "2"]
 
 
 def test_compute_point_colours_differ_at_the_corners():
@@ -259,8 +296,8 @@ def test_save_figure_gives_the_same_bytes_twice(tmp_path):
 
 
 @pytest.mark.parametrize("call", [
-    lambda: plots.plot_teaser({}),
-    lambda: plots.plot_combined({}, {}, {}),
+    lambda: answers.plot_teaser({}),
+    lambda: answers.plot_combined({}, {}, {}),
     lambda: plots.plot_rmse_pdf({}, {}),
     lambda: plots.plot_rmse_pdf({"cloth": {}}, {"cloth": 1.0}),
     lambda: plots.compute_density(np.zeros(3, int), 0.25),

@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 
 from mmgsd.report.claims import list_claims
-from mmgsd.report.findings import FINDINGS, REPEATS, make_claims_table, make_findings, sum_minutes, to_markdown
+from mmgsd.report.findings import FINDINGS, REPEATS, describe_claims, make_findings, sum_minutes
 from mmgsd.report.results import load_results
+from mmgsd.report.tables import to_markdown
 
 RESULTS = load_results(Path(__file__).resolve().parents[2] / "data" / "results" / "paper")
 
@@ -23,7 +24,7 @@ def test_a_finding_changes_with_its_results() -> None:
 
 
 def test_every_claim_is_a_row_with_what_repeats_it() -> None:
-    claims, rows = list_claims(RESULTS), make_claims_table(RESULTS).splitlines()[2:]
+    claims, rows = list_claims(RESULTS), to_markdown(describe_claims(RESULTS)).splitlines()[2:]
     assert [claim.key for claim in claims] == list(REPEATS)
     for claim, row in zip(claims, rows, strict=True):
         assert f"| **{claim.verdict}** |" in row and REPEATS[claim.key][0] in row
@@ -31,7 +32,7 @@ def test_every_claim_is_a_row_with_what_repeats_it() -> None:
 
 
 def test_a_claim_without_results_is_not_measured() -> None:
-    assert "**not measured**" in make_claims_table({})
+    assert "**not measured**" in to_markdown(describe_claims({}))
 
 
 @pytest.mark.parametrize(
@@ -41,8 +42,3 @@ def test_minutes_are_summed_over_the_runs_that_are_stored(key: str, models: tupl
     results = {"runs": {"cloth-mmgsd": {"minutes": 20.2}, "rope-mmgsd": {"minutes": 30.1}},
                "sigma": {"cloth": {"1": {"run": {"minutes": 7.0}}}}}  # fmt: skip
     assert sum_minutes(results, key, models) == minutes
-
-
-def test_latex_becomes_markdown() -> None:
-    latex = r"\texttt{v4}: 5~px, 47.7\,\%, $\sigma = 1$, $\pm 45^\circ$, --"
-    assert to_markdown(latex) == "`v4`: 5 px, 47.7 %, σ = 1, ±45°, –"

@@ -12,12 +12,12 @@ from mmgsd.config import METHODS, OBJECTS, PRESETS, find_root
 from mmgsd.figures.symmetry import find_regions
 from mmgsd.measure.figure_data import FigureData
 from mmgsd.measure.metrics import PCK_PX, summarise_errors
-from mmgsd.report import latex_tables as report_tables
 from mmgsd.report.claims import HELD, IN_PART, NOT_HELD, NOT_MEASURED, RULES, get, is_better, judge, list_claims
+from mmgsd.report.descriptions import LABELS
+from mmgsd.report.findings import describe_claims
 from mmgsd.report.latex import flatten, make_definitions, write_report
-from mmgsd.report.latex_tables import NOT_RUN, TABLES, escape
+from mmgsd.report.latex_tables import CLAIMS, NOT_RUN, TABLES, escape, set_text, to_latex
 from mmgsd.report.results import FILES, load_results, measure_places
-from mmgsd.report.tables import LABELS
 
 ROOT = find_root(Path(__file__).parent)
 GROUPS, REGIONS = ("v4", "c4", "d4"), ("corner", "edge", "interior")
@@ -140,7 +140,7 @@ def test_what_was_not_run_is_not_measured() -> None:
     started = {"rmse": {"cloth": {"mmgsd": make_errors(30.0)}, "rope": {}}, "runs": {}}  # one model is done
     verdicts = judge_all(started)
     assert verdicts.pop("rmse") == IN_PART and set(verdicts.values()) == {NOT_MEASURED}
-    assert "30.0" in TABLES["main_table"][1](started["rmse"]) and TABLES["runs_table"][1](started["runs"])
+    assert "30.0" in make_table("main_table", started["rmse"]) and make_table("runs_table", started["runs"])
 
 
 def test_without_places_the_interior_is_the_studys() -> None:
@@ -167,6 +167,10 @@ def test_escape_leaves_no_special_character() -> None:
     assert r"\defresult{a}{50 \% \_}" in make_definitions("quick", {"a": "50 % _"})
 
 
+def make_table(name: str, results: dict) -> str:
+    return to_latex(TABLES[name][1](results))
+
+
 def read_rows(table: str) -> dict[str, list[str]]:
     """{first cell: the others} of a table's rows; of equal ones, the last."""
     lines = [line.removesuffix(r" \\").split(" & ") for line in table.splitlines() if line.endswith(r" \\")]
@@ -175,58 +179,63 @@ def read_rows(table: str) -> dict[str, list[str]]:
 
 def test_main_table_has_every_method_with_its_numbers() -> None:
     rmse = json.loads((ROOT / "data/results/quick/rmse.json").read_text())
-    rows = read_rows(TABLES["main_table"][1](rmse))
+    rows = read_rows(make_table("main_table", rmse))
     for method, metrics in rmse["rope"].items():
-        cells = rows[LABELS[method].replace("*", "")]
+        cells = rows[set_text(LABELS[method])]
         assert [float(c) for c in cells[:3]] == pytest.approx(
             [metrics[m] for m in ("rmse_mean", "rmse_pooled", "median")], abs=0.051
         )
         assert [float(c) for c in cells[3:6]] == pytest.approx([100 * metrics[f"pck@{t}px"] for t in PCK_PX], abs=0.051)
         assert float(cells[7]) == pytest.approx(metrics["rmse_mean_all"], abs=0.051) and len(cells) == 14
-    assert rows[r"\emph{the paper's MMGSD}"] == [r"\emph{31.3}"]
+    assert rows[r"\emph{the paper's MMGSD, 3,500 images each}"] == [r"\emph{31.3}"] + ["--"] * 13
 
 
 def test_budget_table_has_the_objects_that_were_trained() -> None:
     results = make_results()
-    text = TABLES["budget_table"][1](results["budget"])
+    text = make_table("budget_table", results["budget"])
     assert read_rows(text)["SPCL"][0] == "80.0" and "Cloth" in text and "Rope" not in text and "31.3" not in text
     improvement = next(claim for claim in list_claims(results) if claim.key == "improvement")
-    assert improvement.measured.endswith(r"budget: cloth 50\,\%, rope --")
+    assert improvement.measured.endswith("budget: cloth 50 %, rope –")
 
 
 def test_a_longer_training_is_a_row_that_latex_can_set() -> None:
     row = make_results()["rmse"]["cloth"]["mmgsd"]
-    assert r"MMGSD, 3 $\times$ the steps" in read_rows(TABLES["main_table"][1]({"cloth": {"mmgsd_long": row}}))
+    assert r"MMGSD, 3 $\times$ the steps" in read_rows(make_table("main_table", {"cloth": {"mmgsd_long": row}}))
 
 
 def test_swap_rate_has_its_column_where_it_was_measured() -> None:
     results = make_results()["rmse"]
-    assert read_rows(TABLES["main_table"][1](results))["MMGSD (ours)"][6] == "25.0"
+    assert read_rows(make_table("main_table", results))[r"\textbf{MMGSD} (ours)"][6] == "25.0"
     del results["rope"]["mmgsd"]["swap_rate"]
-    assert read_rows(TABLES["main_table"][1](results))["MMGSD (ours)"][6] == "--"
+    assert read_rows(make_table("main_table", results))[r"\textbf{MMGSD} (ours)"][6] == "--"
 
 
 def test_other_tables_have_their_numbers() -> None:
     results = make_results()
-    rows = {name: read_rows(make(results[file])) for name, (file, make) in TABLES.items()}
+    rows = {name: read_rows(to_latex(make(results[file]))) for name, (file, make) in TABLES.items()}
     assert rows["sigma_table"]["4"] == ["50.0", "49.0", "20.0"] * 2
     assert list(rows["sigma_table"])[-3:] == ["1", "4", "16"]
-    assert rows["symmetry_table"][r"\texttt{v4}"] == ["40.0", "30.0", "50.0", "60.0", "3.00", "5.00", "6.00"]
-    assert rows["uncertainty_table"]["MMGSD (ours)"][5] == r"50\,$\to$\,91"
-    assert rows["uncertainty_table"]["MMGSD (ours)"][-2:] == ["0.60", "--"]
+    assert rows["symmetry_table"][r"\texttt{v4}, the flips"] == ["40.0", "30.0", "50.0", "60.0", "3.00", "5.00", "6.00"]
+    assert rows["uncertainty_table"][r"\textbf{MMGSD} (ours)"][5] == r"50\,$\to$\,91"
+    assert rows["uncertainty_table"][r"\textbf{MMGSD} (ours)"][-2:] == ["0.60", "--"]
     assert rows["fixes_table"][r"cloth, $\pm$45$^\circ$ only"] == ["60.0", "59.0", "20.0", "--", "40", "--"]
     assert rows["errors_table"]["no match hidden"] == ["25.0", "25.0"]
     assert rows["runs_table"]["SPCL"] == ["100", "1.5"] * 2
 
 
 def test_negative_numbers_have_a_minus() -> None:
-    assert report_tables._say(-0.05, ".2f") == "$-$0.05"
+    assert set_text("-0.05 → -1") == r"$-$0.05\,$\to$\,$-$1" and set_text("8-15, a-b") == "8-15, a-b"
+
+
+def test_markup_and_units_are_set() -> None:
+    assert set_text("**ours**, *theirs*, `v_4`") == r"\textbf{ours}, \emph{theirs}, \texttt{v\_4}"
+    assert set_text("50 % within 20 px; σ px") == r"50\,\% within 20~px; $\sigma$ px"
 
 
 def test_claims_table_prints_each_verdict() -> None:
-    table = report_tables.make_claims_table(list_claims(make_results()))
+    table = to_latex(describe_claims(make_results()), CLAIMS)
     assert [c for c in re.findall(r"\\textbf\{([^}]*)\}", table)] == list(judge_all(make_results()).values())
-    assert "no results for this preset" in report_tables.make_claims_table(list_claims({}))
+    assert "no results for this preset" in to_latex(describe_claims({}), CLAIMS)
 
 
 def test_a_preset_without_results_has_every_file(tmp_path: Path) -> None:
@@ -256,7 +265,7 @@ def test_a_preset_that_does_not_exist_is_refused(tmp_path: Path) -> None:
 def test_places_are_means_over_visible_queries(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     points = np.arange(625)
     queries = pd.DataFrame({"point": points, "visible": points != 312, "rmse_px": np.abs(points - 312.0)})
-    data = FigureData({"mmgsd": summarise_errors(queries)}, 1.0, {}, np.zeros((4, 2)))
+    data = FigureData({"mmgsd": summarise_errors(queries)}, 1.0, {}, [np.zeros((4, 2))])
     monkeypatch.setattr("mmgsd.measure.figure_data.load_figure_data", lambda path: data)
     rope = measure_places(tmp_path / "figures_rope.safetensors", "rope")
     assert rope["end"] > 250 and rope["middle"] == pytest.approx(31.5, abs=1)  # 1 to 62, without the hidden one
