@@ -39,6 +39,12 @@ def times(factor: float, *, of: int = 0) -> Rule:
     return Rule(f"× {factor:g}", apply)
 
 
+def by_object(**values: float) -> Rule:
+    """Another value for each object."""
+    text = ", ".join(f"{value} ({name})" for name, value in values.items())
+    return Rule(text, lambda start, _: values[start.object])
+
+
 ITS_OWN = Rule("the weights of what it starts from", lambda start, _: start.name)
 PAPER_ONLY = Rule("the shipped weights of the paper's images", lambda start, _: f"{start.object}-paper")
 
@@ -82,7 +88,8 @@ MODELS = (
           {"network": "lite0x2fine", "optimiser": "muon", "input_px": times(2), "roundness": 0.05}, ("main",),
           "MMGSD, Muon", "#FF3D00"),
     Model("shipped", "MMGSD, shipped: photographs too", "mmgsd_muon",
-          {"trunk_weights": PAPER_ONLY, "heads": True, "clutter": True, "also": "workspace", "steps": times(0.25),
+          {"trunk_weights": PAPER_ONLY, "heads": True, "clutter": True, "also": "workspace",
+           "steps": by_object(cloth=3000, rope=2000),
            "learning_rate": times(2 / 3), "sigma_start_px": 8.0, "prototype_weight": 0.0}, ("main", "shipped"),
           "MMGSD, shipped", "#A6761D"),
     Model("mmgsd_plain", "MMGSD, own loss alone", "mmgsd", {"prototype_weight": 0.0},
