@@ -87,7 +87,7 @@ MODELS = (
     Model("mmgsd_muon", "MMGSD, Muon, detail branch", "mmgsd_long",
           {"network": "lite0x2fine", "optimiser": "muon", "input_px": times(2), "roundness": 0.05}, ("main",),
           "MMGSD, Muon", "#FF3D00"),
-    Model("shipped", "MMGSD, shipped: photographs too", "mmgsd_muon",
+    Model("shipped", "MMGSD, shipped: clutter too", "mmgsd_muon",
           {"trunk_weights": PAPER_ONLY, "heads": True, "clutter": True, "also": "workspace",
            "steps": by_object(cloth=3000, rope=2000),
            "learning_rate": times(2 / 3), "sigma_start_px": 8.0, "prototype_weight": 0.0}, ("main", "shipped"),
