@@ -1,0 +1,27 @@
+"""A stored figure is shown small enough to be kept in a notebook."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from mmgsd.figures.stored import WIDTH_PX, show_stored
+
+
+@pytest.mark.parametrize(("size", "shown"), [((2 * WIDTH_PX, 600), (WIDTH_PX, 300)), ((300, 200), (300, 200))])
+@pytest.mark.parametrize("kind", ["png", "jpg"])
+def test_a_wide_figure_is_shrunk_and_a_small_one_stays(
+    tmp_path: Path, size: tuple[int, int], shown: tuple[int, int], kind: str
+) -> None:
+    Image.new("RGB", size, "white").save(tmp_path / f"figure.{kind}")
+    picture = show_stored(tmp_path / f"figure.{kind}")
+    assert picture.format == "jpeg"
+    assert Image.open(io.BytesIO(picture.data)).size == shown
+
+
+def test_a_figure_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"none\.png"):
+        show_stored(tmp_path / "none.png")
