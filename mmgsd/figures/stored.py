@@ -8,14 +8,15 @@ from pathlib import Path
 from IPython.display import Image as Shown
 from PIL import Image
 
-WIDTH_PX, QUALITY = 1065, 80  # of a page's figure at 150 dpi; of JPEG
+DRAWN, PHOTOGRAPHS = (1065, 80, 0), (900, 75, 2)  # px wide at most, and JPEG's quality and subsampling
 
 
 def show_stored(path: Path) -> Shown:
-    """The picture of a file, at most `WIDTH_PX` wide, as JPEG; FileNotFoundError where there is none."""
+    """The picture of a file, shrunk, as JPEG: a PNG as what is drawn, others as photographs; or FileNotFoundError."""
+    width, quality, subsampling = DRAWN if path.suffix == ".png" else PHOTOGRAPHS
     with Image.open(path) as opened:
         picture = opened.convert("RGB")
-    picture.thumbnail((WIDTH_PX, 4 * WIDTH_PX), Image.Resampling.LANCZOS)
+    picture.thumbnail((width, picture.height), Image.Resampling.LANCZOS)
     written = io.BytesIO()
-    picture.save(written, "JPEG", quality=QUALITY, subsampling=0, optimize=True)
+    picture.save(written, "JPEG", quality=quality, subsampling=subsampling, optimize=True)
     return Shown(written.getvalue(), format="jpeg")

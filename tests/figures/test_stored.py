@@ -8,18 +8,16 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from mmgsd.figures.stored import WIDTH_PX, show_stored
+from mmgsd.figures.stored import DRAWN, PHOTOGRAPHS, show_stored
 
 
-@pytest.mark.parametrize(("size", "shown"), [((2 * WIDTH_PX, 600), (WIDTH_PX, 300)), ((300, 200), (300, 200))])
-@pytest.mark.parametrize("kind", ["png", "jpg"])
-def test_a_wide_figure_is_shrunk_and_a_small_one_stays(
-    tmp_path: Path, size: tuple[int, int], shown: tuple[int, int], kind: str
-) -> None:
-    Image.new("RGB", size, "white").save(tmp_path / f"figure.{kind}")
-    picture = show_stored(tmp_path / f"figure.{kind}")
-    assert picture.format == "jpeg"
-    assert Image.open(io.BytesIO(picture.data)).size == shown
+@pytest.mark.parametrize(("kind", "width"), [("png", DRAWN[0]), ("jpg", PHOTOGRAPHS[0])])
+def test_a_wide_figure_is_shrunk_and_a_small_one_stays(tmp_path: Path, kind: str, width: int) -> None:
+    for size, shown in (((2 * width, 600), (width, 300)), ((300, 200), (300, 200)), ((200, 300), (200, 300))):
+        Image.new("RGB", size, "white").save(tmp_path / f"figure.{kind}")
+        picture = show_stored(tmp_path / f"figure.{kind}")
+        assert picture.format == "jpeg"
+        assert Image.open(io.BytesIO(picture.data)).size == shown
 
 
 def test_a_figure_that_is_not_there_is_named(tmp_path: Path) -> None:
