@@ -58,7 +58,7 @@ notebooks-test: $(STAMP) ## Run the notebooks and compare their outputs with the
 
 figures: $(STAMP) ## Draw the paper's figures of PRESET (paper) again from data/results, without training
 	@mkdir -p data/generated
-	$(PAPERMILL) notebooks/07_figures.ipynb data/generated/figures_$(PRESET).ipynb -p preset $(PRESET)
+	$(PAPERMILL) notebooks/07_figures.ipynb data/generated/figures_$(PRESET).ipynb -p preset $(PRESET) -p run True
 
 readme: $(STAMP) ## Put the numbers of data/results into README.md, the results page and docs/claims.md
 	$(PY) -m mmgsd.report.tables data/results README.md data/results/README.md docs/claims.md

@@ -52,14 +52,19 @@ def check_made(paths: Paths, by: str, files: Iterable[Path], **told: str) -> Non
             raise ValueError(f"for {same} there is no {place} yet: run {by} for it first")
 
 
+def check_stored(paths: Paths, notebook: str, *names: str) -> None:
+    """ValueError where the preset has no results of one of these names yet; ``notebook`` makes them, if it is to."""
+    check_made(paths, f"{notebook} with run=True", [paths.results / name for name in names])
+
+
 def check_images(paths: Paths, objects: Iterable[str], *, split: str = "test") -> None:
     """ValueError where the images of a split of any of ``objects`` are not rendered."""
     files = [paths.dataset(name) / "dataset.json" for name in objects]
-    check_made(paths, "01_render_data", files)
+    check_made(paths, "01_render_data with run=True", files)
     for file in files:
         if split not in json.loads(file.read_text())["images"]:
             raise ValueError(f"for preset={paths.preset!r} there are no {split} images in {file.parent}: "
-                             "run 01_render_data for it with only_test=False first")  # fmt: skip
+                             "run 01_render_data for it with run=True, only_test=False first")  # fmt: skip
 
 
 def check_training(paths: Paths, models: Iterable[TrainConfig], *, overwrite: bool = False) -> None:

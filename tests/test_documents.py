@@ -64,6 +64,7 @@ def test_notebooks_have_the_parameters_that_commands_give_them(path: Path) -> No
         parameters = next(cell.source for cell in cells if "parameters" in cell.metadata.get("tags", []))
         for name in re.findall(r"-p (\w+) ", options):
             assert re.search(rf"^{name} = ", parameters, re.MULTILINE), (notebook, name)
+        assert "-p run True" in options or "\nrun = " not in parameters, (notebook, "computes nothing")
 
 
 @pytest.mark.parametrize(("name", "words"), [("README.md", 1000), ("data/results/README.md", 1500)])

@@ -80,7 +80,7 @@ def run_until_it_lacks_data(notebook: str, **injected: Any) -> dict[str, Any]:
         try:
             run_first_cells(notebook, **injected)
         except ValueError as error:
-            assert "there is no data/" in str(error)
+            assert "there is no data/" in str(error) or "there is no figures/" in str(error)
     return read
 
 
@@ -88,10 +88,14 @@ def list_assigned(source: str) -> list[str]:
     return [statement.targets[0].id for statement in ast.parse(source).body]
 
 
+STAGES = [path.stem for path in NOTEBOOKS if path.stem[0].isdigit()]
+SMOKE = {"preset": "smoke", "run": True}
 FLAGS = {
-    "01_render_data": ("overwrite", "only_test"), "03_train": ("overwrite",), "04_evaluate": ("overwrite",),
-    "05_sigma_ablation": ("overwrite",), "06_uncertainty": ("overwrite",), "08_symmetry_study": ("overwrite",),
-    "11_broken_symmetry": ("overwrite",), "run_all": ("overwrite",), "your_object": ("overwrite",),
+    "01_render_data": ("run", "overwrite", "only_test"), "02_inspect_data": ("run",), "03_train": ("run", "overwrite"),
+    "04_evaluate": ("run", "overwrite"), "05_sigma_ablation": ("run", "overwrite"),
+    "06_uncertainty": ("run", "overwrite"), "07_figures": ("run",), "08_symmetry_study": ("run", "overwrite"),
+    "09_error_analysis": ("run",), "11_broken_symmetry": ("run", "overwrite"), "run_all": ("overwrite",),
+    "your_object": ("overwrite",),
 }  # fmt: skip
 WRONG = [  # notebook, parameter, what it was given, what the error says besides the parameter's name
     *((path.stem, "preset", value, PRESETS) for path in CHECKED for value in ("papr", 3, None, ["quick"])
@@ -125,7 +129,6 @@ WRONG = [  # notebook, parameter, what it was given, what the error says besides
     ("04_evaluate", "drawn", {"sift": 1}, "a list"),
     ("04_evaluate", "points", [0, 104, 208], "4, got"),
     ("04_evaluate", "points", [0, 104, 208, 9999], "from 0 to 624, got 9999"),
-    ("04_evaluate", "points", [0, 104, 208, 313], "one of the points that the preset asks about (0, 26, 52, … 624)"),
     ("05_sigma_ablation", "sigmas_px", [0], "greater than 0, got 0"),
     ("05_sigma_ablation", "sigmas_px", [1.0, -4.0], "greater than 0, got -4.0"),
     ("05_sigma_ablation", "sigmas_px", [float("nan")], "greater than 0, got nan"),
@@ -239,15 +242,24 @@ def test_a_notebook_reads_all_of_its_parameters(empty_root, notebook):
     assert sorted(run_until_it_lacks_data(notebook)) == sorted(list_assigned(tagged))
 
 
+STORED = "for preset='paper' there is no data/results/paper/"
 MISSING = [  # notebook, what it is told, what it asks for
-    ("02_inspect_data", {}, "preset='smoke' there is no data/generated/smoke/cloth/dataset.json yet: run 01_render_"),
-    ("03_train", {}, "run 01_render_data for it first"),
-    ("04_evaluate", {}, "run 01_render_data for it first"),
-    ("05_sigma_ablation", {}, "run 01_render_data for it first"),
-    ("06_uncertainty", {}, "run 01_render_data for it first"),
+    ("02_inspect_data", SMOKE, "preset='smoke' there is no data/generated/smoke/cloth/dataset.json yet: run 01_"),
+    ("02_inspect_data", {}, "no figures/data/paper_variety.png yet: run 02_inspect_data with run=True for it first"),
+    ("03_train", SMOKE, "run 01_render_data with run=True for it first"),
+    ("03_train", {}, STORED + "runs.json yet: run 04_evaluate with run=True for it first"),
+    ("04_evaluate", SMOKE, "run 01_render_data with run=True for it first"),
+    ("04_evaluate", {}, STORED + "rmse.json yet: run 04_evaluate with run=True for it first"),
+    ("05_sigma_ablation", SMOKE, "run 01_render_data with run=True for it first"),
+    ("05_sigma_ablation", {"steps": 4000}, STORED + "sigma_4000.json yet: run 05_sigma_ablation with run=True"),
+    ("06_uncertainty", SMOKE, "run 01_render_data with run=True for it first"),
+    ("06_uncertainty", {}, STORED + "uncertainty.json yet: run 06_uncertainty with run=True for it first"),
     ("07_figures", {"preset": "quick"}, "for preset='quick' there is no data/results/quick/figures_cloth.safetensors"),
-    ("08_symmetry_study", {}, "run 01_render_data for it first"),
-    ("09_error_analysis", {"objects": "rope"}, "smoke/rope/dataset.json yet"),
+    ("08_symmetry_study", SMOKE, "run 01_render_data with run=True for it first"),
+    ("08_symmetry_study", {}, STORED + "symmetry.json yet: run 08_symmetry_study with run=True for it first"),
+    ("09_error_analysis", {**SMOKE, "objects": "rope"}, "smoke/rope/dataset.json yet"),
+    ("09_error_analysis", {"method": "spcl"}, STORED + "errors_spcl.json yet: run 09_error_analysis with run=True"),
+    ("11_broken_symmetry", {}, STORED + "broken_symmetry.json yet: run 11_broken_symmetry with run=True for it first"),
 ]
 
 
@@ -256,6 +268,19 @@ def test_what_has_to_be_run_first_is_said(empty_root, notebook, told, said):
     with pytest.raises(ValueError) as refused:
         run_first_cells(notebook, **told)
     assert said in str(refused.value)
+
+
+@pytest.mark.parametrize("notebook", STAGES)
+def test_what_is_committed_shows_the_papers_size_and_runs_nothing(notebook):
+    cells = nbformat.read(ROOT / "notebooks" / f"{notebook}.ipynb", 4).cells
+    (tagged,) = (cell.source for cell in cells if "parameters" in cell.metadata.get("tags", ()))
+    assert tagged.startswith('preset = "paper"  # ') and "\nrun = False  # True " in tagged
+
+
+def test_a_point_that_a_small_preset_does_not_ask_about_is_refused(empty_root):
+    said = r"points must be one of the points that the preset asks about \(0, 26, 52, … 624\), got 313"
+    with pytest.raises(ValueError, match=said):
+        run_first_cells("04_evaluate", preset="smoke", points=[0, 104, 208, 313])
 
 
 def render_nothing(root: Path, *splits: str) -> None:
@@ -269,24 +294,24 @@ def render_nothing(root: Path, *splits: str) -> None:
 @pytest.mark.parametrize("notebook", ["03_train", "05_sigma_ablation", "08_symmetry_study"])
 def test_training_asks_for_the_images_that_were_left_out(empty_root, notebook):
     render_nothing(empty_root, "test")
-    with pytest.raises(ValueError, match="no train images in .*: run 01_render_data for it with only_test=False first"):
-        run_first_cells(notebook)
-    with pytest.raises(ValueError, match="run 01_render_data for it with only_test=False first"):
-        run_first_cells("02_inspect_data")
+    with pytest.raises(ValueError, match="no train images in .* for it with run=True, only_test=False first"):
+        run_first_cells(notebook, **SMOKE)
+    with pytest.raises(ValueError, match="run 01_render_data for it with run=True, only_test=False first"):
+        run_first_cells("02_inspect_data", **SMOKE)
 
 
 @pytest.mark.parametrize(
     ("notebook", "told", "by"),
     [
-        ("04_evaluate", {}, "run 03_train for it first"),
-        ("06_uncertainty", {}, "run 03_train for it first"),
+        ("04_evaluate", {}, "run 03_train with run=True for it first"),
+        ("06_uncertainty", {}, "run 03_train with run=True for it first"),
         ("09_error_analysis", {"method": "pcl"}, "for preset='smoke', method='pcl' there is no .*measure.matrix"),
     ],
 )
 def test_a_method_that_is_not_trained_is_named(empty_root, notebook, told, by):
     render_nothing(empty_root, "train", "test")
     with pytest.raises(ValueError, match=by):
-        run_first_cells(notebook, **told)
+        run_first_cells(notebook, **SMOKE, **told)
 
 
 def test_a_start_of_another_network_is_refused_before_rendering(empty_root, cloth_dataset):

@@ -45,7 +45,8 @@ def test_the_smoke_experiment_runs_from_any_folder_draws_every_figure_and_ends_w
     assert {f"{name}.{kind}" for name in names for kind in ("pdf", "png")} <= drawn
     rendered = ROOT / "data" / "generated" / "smoke" / "cloth" / "dataset.json"
     before = rendered.stat()
-    done = run_papermill(tmp_path, "-p", "overwrite", "false", notebook="01_render_data")
+    told = ("-p", "preset", "smoke", "-p", "run", "true", "-p", "overwrite", "false")
+    done = run_papermill(tmp_path, *told, notebook="01_render_data")
     assert done.returncode == 0, done.stderr[-3000:]
     after = rendered.stat()
     assert (after.st_mtime_ns, after.st_ino) == (before.st_mtime_ns, before.st_ino)

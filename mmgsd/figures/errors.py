@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -118,6 +119,17 @@ def _name_bin(first: float, last: float) -> str:
 def choose_worst(described: pd.DataFrame, count: int = 24) -> pd.DataFrame:
     """The ``count`` queries with the greatest error, at most one of each pair of images, the worst first."""
     return described.sort_values("rmse_px", ascending=False).drop_duplicates("pair").head(count)
+
+
+def plot_worst_queries(described: pd.DataFrame, data: Dataset, matcher: Any, *, count: int = 24) -> Figure:
+    """`plot_worst` of the queries of `choose_worst`, asked anew: a table of answers holds no heatmaps."""
+    rows, orbits = choose_worst(described, count), data.group()
+    matches = [
+        matcher.match(*map(data.load_image, (row.image0, row.image1)), data.xy[row.image0, [row.point]], n=int(row.n))
+        for row in rows.itertuples()
+    ]
+    true = [data.xy[row.image1][orbits.distinct_modes(row.point)] for row in rows.itertuples()]
+    return plot_worst(matches, true, rows.rmse_px.tolist())
 
 
 @styled

@@ -23,6 +23,7 @@ from mmgsd.measure.metrics import aggregate
 from mmgsd.measure.questions import Answer, ask, model_answer
 
 CHANCE = ("centre", "random")
+ASKED = ["pair", "image0", "image1", "point", "visible", "n", "hidden"]  # columns that are the same for all methods
 MEASURES = "3"  # to be raised where the same answers are measured in another way
 
 
@@ -94,6 +95,15 @@ def load_queries(path: Path) -> pd.DataFrame:
     if missing:
         raise DamagedFileError(f"{path} lacks the columns {missing}: use overwrite=True")
     return queries
+
+
+def check_same_questions(tables: dict[str, pd.DataFrame]) -> None:
+    """ValueError unless all methods of ``tables`` {method: queries} answered the same queries, in one order."""
+    first, *others = tables
+    for method in others:
+        if not tables[method][ASKED].equals(tables[first][ASKED]):
+            raise ValueError(f"tables must answer the same queries, got other ones of {method!r} than of {first!r}: "
+                             "use overwrite=True")  # fmt: skip
 
 
 def summarise(tables: dict[str, Path]) -> dict[str, dict[str, float]]:

@@ -145,7 +145,7 @@ def save_figure_data(data: FigureData, path: Path) -> Path:
 def load_figure_data(path: Path) -> FigureData:
     """Read what `save_figure_data` wrote; FileNotFoundError, or ValueError for another or a damaged file."""
     if not path.is_file():
-        raise FileNotFoundError(f"{path} does not exist: run notebooks/04_evaluate.ipynb for this preset")
+        raise FileNotFoundError(f"{path} does not exist: run notebooks/04_evaluate.ipynb with run=True for this preset")
     try:
         with safe_open(path, "np") as file:
             note = json.loads(file.metadata()["figures"])
@@ -158,5 +158,5 @@ def load_figure_data(path: Path) -> FigureData:
         true = [tensors[TRUE.format(k or "")] for k in range(sum(name.startswith("true") for name in tensors))]
         return FigureData(errors, float(note["object_size_px"]), answers, true)
     except (SafetensorError, OSError, KeyError, TypeError, ValueError, AttributeError, cv2.error) as error:
-        remedy = "restore it (it may be in git), or run notebooks/04_evaluate.ipynb for this preset"
+        remedy = "restore it (it may be in git), or run notebooks/04_evaluate.ipynb with run=True for this preset"
         raise DamagedFileError(f"{path} does not hold the data of figures ({error}): {remedy}") from error

@@ -134,9 +134,7 @@ class Screen:
             print(line, file=self.out, flush=True)
 
 
-def describe_state(
-    state: Mapping[str, Any], stored: Mapping[str, float], doing: str, now: float, begun: float
-) -> str:
+def describe_state(state: Mapping[str, Any], stored: Mapping[str, float], doing: str, now: float, begun: float) -> str:
     """One line: which stage, for how long, how long all and the rest take, and what its bar says."""
     elapsed = (now - state["since"]) / 60
     left = estimate_left(state, stored, elapsed)

@@ -12,7 +12,7 @@ import numpy as np
 from mmgsd.config import N_POINTS, OBJECTS
 from mmgsd.files import DamagedFileError, read_json
 
-REMEDY = "restore it (it may be in git), or run its notebook again"
+REMEDY = "restore it (it may be in git), or run its notebook again with run=True"
 PAPER = {"cloth": 32.4, "rope": 31.3}  # px, MMGSD's RMSE as the paper reports it
 FILES = ("rmse", "runs", "budget", "sigma", "uncertainty", "symmetry", "broken_symmetry", "errors", "seeds_1000")
 ENDS = 0.1  # of a rope's length at each end, its extremities; the middle is the fifth around its centre

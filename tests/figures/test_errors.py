@@ -11,7 +11,14 @@ import pytest
 from heatmaps import SIZE
 
 from mmgsd.dataset import Dataset, load_dataset
-from mmgsd.figures.errors import choose_worst, describe_queries, plot_error_analysis, plot_worst, summarise_states
+from mmgsd.figures.errors import (
+    choose_worst,
+    describe_queries,
+    plot_error_analysis,
+    plot_worst,
+    plot_worst_queries,
+    summarise_states,
+)
 from mmgsd.match.match import Match
 
 
@@ -86,3 +93,24 @@ def test_states_of_enough_pairs_have_no_brackets_and_absent_ones_no_number(data:
 def test_nothing_to_draw_is_refused() -> None:
     with pytest.raises(ValueError, match="tables must not be empty"):
         plot_error_analysis({})
+
+
+class Told:
+    """Stands for a matcher: what it was asked, and one mode for each match."""
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[np.ndarray, int]] = []
+
+    def match(self, image0: np.ndarray, image1: np.ndarray, xy: np.ndarray, *, n: int) -> Match:
+        self.asked.append((xy, n))
+        round_modes = np.tile(9 * np.eye(2), (1, n, 1, 1))
+        return Match(image0, image1, xy, np.full((1, n, 2), 50.0), np.ones((1, n)) / n, round_modes, np.zeros(1),
+                     np.zeros(1), np.ones((1, 8, 8)) / 64)  # fmt: skip
+
+
+def test_the_worst_queries_are_asked_anew(data: Dataset) -> None:
+    described, matcher = describe_queries(make_queries([0, 30, 312]).assign(n=[4, 4, 1]), data), Told()
+    figure = plot_worst_queries(described, data, matcher, count=2)
+    assert [axis.get_title() for axis in figure.axes] == ["20 px", "10 px"]
+    assert [n for _, n in matcher.asked] == [1, 4]
+    np.testing.assert_array_equal(matcher.asked[0][0], data.xy[0, [312]])

@@ -20,6 +20,7 @@ from mmgsd.match.mixture import Mixture
 from mmgsd.measure import evaluation, questions
 from mmgsd.measure.evaluation import (
     BASELINES,
+    check_same_questions,
     evaluate_baseline,
     evaluate_model,
     load_queries,
@@ -295,3 +296,11 @@ def test_weights_of_another_object_are_refused(cloth_dataset: Path, tmp_path: Pa
 def test_what_cannot_be_asked(cloth_dataset: Path, tmp_path: Path, untrained: Path, asked: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         evaluate_model(untrained, cloth_dataset, CONFIG, tmp_path / "out.parquet", progress=False, **asked)
+
+
+def test_answers_to_other_questions_are_not_compared(cloth_dataset: Path, tmp_path: Path) -> None:
+    tables = {method: ask_baseline(method, cloth_dataset, tmp_path / method) for method in ("centre", "random")}
+    check_same_questions(tables)
+    tables["random"] = tables["random"].assign(point=tables["random"].point + 1)
+    with pytest.raises(ValueError, match="tables must answer the same queries, got other ones of 'random' than of"):
+        check_same_questions(tables)
