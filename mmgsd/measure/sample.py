@@ -9,10 +9,11 @@ import pandas as pd
 from mmgsd.checks import check_choice
 from mmgsd.config import EvaluateConfig
 from mmgsd.dataset import Dataset, load_dataset
+from mmgsd.experiments import SHIPPED
 from mmgsd.match.matcher import Matcher, load
 from mmgsd.measure.questions import ask, model_answer
 
-SHIPPED = {"mmgsd": "paper", "spcl": "spcl"}  # method: how the name of its shipped weights ends
+PAPER_SIZE = ("mmgsd", "spcl")  # methods whose shipped weights learnt from the paper's images alone
 QUESTIONS = EvaluateConfig(pairs=40, points=65)  # a few thousand queries
 
 
@@ -23,8 +24,8 @@ def load_sample(root: Path, object: str) -> Dataset:
 
 def load_shipped(object: str, method: str = "mmgsd") -> Matcher:
     """The shipped model of a method, trained on the paper's images alone; ValueError for a method without one."""
-    check_choice("method", method, tuple(SHIPPED))
-    return load(f"{object}-{SHIPPED[method]}")
+    check_choice("method", method, PAPER_SIZE)
+    return load(f"{object}{SHIPPED[method]}")
 
 
 def ask_sample(matcher: Matcher, data: Dataset, *, group: str = "", modes: int = 0) -> pd.DataFrame:

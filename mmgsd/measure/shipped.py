@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from mmgsd.command import run_command
 from mmgsd.config import OBJECTS, EvaluateConfig, Paths, find_root, load_preset
@@ -28,14 +29,21 @@ from mmgsd.files import read_json, write_json
 from mmgsd.learn.checkpoints import WEIGHTS
 from mmgsd.learn.training import name_hardware
 from mmgsd.match.baselines import BASELINES, BaselineMatcher, FeatureMatcher
-from mmgsd.match.match import Match
+from mmgsd.match.calibration import Calibration
+from mmgsd.match.match import RADIUS_PX, Match
 from mmgsd.match.matcher import Matcher, find_weights
 from mmgsd.measure.evaluation import evaluate_baseline, evaluate_model, load_queries, read_results
 from mmgsd.measure.heads import MEASURES as HEADS
 from mmgsd.measure.heads import evaluate_heads
 from mmgsd.measure.metrics import aggregate
 from mmgsd.measure.photographs import measure_answers, measure_photographs, read_photographs
-from mmgsd.measure.uncertainty import get_modes, measure_modes, summarise_uncertainty
+from mmgsd.measure.uncertainty import (
+    compute_confidences,
+    compute_reliability,
+    get_modes,
+    measure_modes,
+    summarise_uncertainty,
+)
 
 STUDY = "robustness"
 SETS = ("paper", "workspace")  # presets whose test images are asked about
@@ -51,8 +59,8 @@ def measure_weights(
     """The row of ``weights``, or of shipped ones: a dictionary a set of `SETS`, ``photographs``, ``milliseconds``.
 
     Of a set: `mmgsd.measure.metrics.aggregate` over visible sources, `summarise_uncertainty` by the weights' own
-    calibration, ``within_radius``, the share of modes with a true match within `Match.radius_px` (level 0.9), and
-    `measure_heads`. ``milliseconds`` are those of one question about two new images.
+    calibration, its ``reliability`` beside a Gaussian's, ``within_radius``, the share of modes with a true match within
+    `Match.radius_px` (level 0.9), and `measure_heads`. ``milliseconds`` are of one question about two new images.
     """
     file = weights or find_weights(name)
     matcher = Matcher.load(file)
@@ -73,12 +81,19 @@ def measure_weights(
 def _summarise(table: Path, matcher: Matcher) -> dict[str, Any]:
     queries = load_queries(table)
     modes, calibration = get_modes(queries), matcher.calibration
-    within = None
+    within, promises = None, {"Gaussian": None, "calibrated": calibration}
     if calibration is not None:
         radius = calibration.compute_radius(LEVEL, measure_modes(modes))
         within = round(float(np.mean(modes.distance_px.to_numpy() <= radius)), 4)
     return {**aggregate(queries[queries.visible]), **summarise_uncertainty(queries, calibration=calibration),
-            "within_radius": within}  # fmt: skip
+            "within_radius": within,
+            "reliability": {name: _list_reliability(modes, promise) for name, promise in promises.items()}}  # fmt: skip
+
+
+def _list_reliability(modes: pd.DataFrame, promise: Calibration | None) -> dict[str, list[float]]:
+    """The columns of `compute_reliability` at the radius that `Match.confidence` has by default."""
+    rows = compute_reliability(*compute_confidences(modes, RADIUS_PX, promise), modes["pair"].to_numpy())
+    return {name: values.round(4).tolist() for name, values in rows.items()}
 
 
 def _time_question(matcher: Matcher, root: Path) -> dict[str, Any]:

@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[2]
 def test_the_shipped_mmgsd_answers_the_sample_better_than_spcl(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sample, "QUESTIONS", EvaluateConfig(pairs=4, points=9))
     data, errors = sample.load_sample(ROOT, "cloth"), {}
-    for method in sample.SHIPPED:
+    for method in sample.PAPER_SIZE:
         table = sample.ask_sample(sample.load_shipped("cloth", method), data)
         assert len(table) == 36 and table.n.isin([1, 4]).all()
         errors[method] = table.rmse_px[table.visible].mean()
