@@ -60,7 +60,7 @@ def measure_weights(
 
     Of a set: `mmgsd.measure.metrics.aggregate` over visible sources, `summarise_uncertainty` by the weights' own
     calibration, its ``reliability`` beside a Gaussian's, ``within_radius``, the share of modes with a true match within
-    `Match.radius_px` (level 0.9), and `measure_heads`. ``milliseconds`` are of one question about two new images.
+    `Match.radius_px` (level 0.9), and ``heads``, `measure_heads`. ``milliseconds`` are of one question about two new images.
     """
     file = weights or find_weights(name)
     matcher = Matcher.load(file)
@@ -72,7 +72,7 @@ def measure_weights(
         table = evaluate_model(file, data, config, paths.queries(f"shipped-{name}"), progress=progress)
         heads = evaluate_heads(file, data, EvaluateConfig(pairs=HEAD_PAIRS), paths.queries(f"heads-{name}"),
                                progress=progress)  # fmt: skip
-        row[preset] = _summarise(table, matcher) | {key: read_json(heads)[key] for key in HEADS}
+        row[preset] = _summarise(table, matcher) | {"heads": {key: read_json(heads)[key] for key in HEADS}}
     if photographs:
         row["photographs"] = measure_photographs(file, photographs, progress=progress)
     return row | _time_question(matcher, root)

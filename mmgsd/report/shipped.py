@@ -65,7 +65,8 @@ def make_knowledge_table(rows: Rows) -> str:
     for object in OBJECTS:
         for name in (name for name in list_names(rows, object) if "calibrated" in rows[name]):
             for preset, word in SETS.items():
-                found = rows[name].get(preset)
+                found = rows[name].get(preset, {})
+                found = {**found, **found.get("heads", {})}
                 cells = [_format(found, key, 1, ".3f" if "ece" in key else ".2f") for key in measures.values()]
                 lines.append(_join([f"`{name}`, {word}", *cells]))
     return "\n".join(lines)
