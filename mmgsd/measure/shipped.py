@@ -60,7 +60,7 @@ def measure_weights(
 
     Of a set: `mmgsd.measure.metrics.aggregate` over visible sources, `summarise_uncertainty` by the weights' own
     calibration, its ``reliability`` beside a Gaussian's, ``within_radius``, the share of modes with a true match within
-    `Match.radius_px` (level 0.9), and ``heads`` (`measure_heads`). ``milliseconds`` are of one question about two images.
+    `Match.radius_px` (level 0.9), and ``heads`` (`measure_heads`). ``milliseconds``: of one question about two images.
     """
     file = weights or find_weights(name)
     matcher = Matcher.load(file)

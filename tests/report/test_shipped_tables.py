@@ -14,7 +14,8 @@ from mmgsd.report.shipped import (
 FOUND = {"photographs": 34, "found@5%": 0.512, "spurious": 0.25, "best": 8.04, "sources": {"a/b": {}, "c/d": {}}}
 HEADS = {"mask_iou": 0.951, "auroc_visible": 0.9, "auroc_on_object": 0.98, "auroc_absent": None}
 SET = {
-    "rmse_mean": 21.04, "heads": HEADS, "auroc_absent": 0.3, "ece": 0.0264, "ece_confidence": 0.01, "within_radius": 0.91,
+    "rmse_mean": 21.04, "heads": HEADS, "auroc_absent": 0.3, "ece": 0.0264, "ece_confidence": 0.01,
+    "within_radius": 0.91,
 }  # fmt: skip
 ROWS = {
     "cloth-daisy": {"paper": {"rmse_mean": 71.25}},
