@@ -156,10 +156,16 @@ def test_a_killed_command_leaves_no_papermill_behind() -> None:
     wait_for(lambda: not psutil.pid_exists(child) or psutil.Process(child).status() == psutil.STATUS_ZOMBIE)
 
 
+def heed_signals() -> None:
+    """As a command in a terminal does, also where the tests themselves run in the background and ignore them."""
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP], ids=lambda number: number.name)
 def test_the_command_ends_with_one_line_that_says_what_is_kept(number: signal.Signals) -> None:
-    command = [sys.executable, "-c", COMMAND]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    command, pipes = [sys.executable, "-c", COMMAND], {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen(command, **pipes, text=True, preexec_fn=heed_signals) as process:
         assert "smoke" in process.stdout.readline()
         child = int(process.stdout.readline())
         process.send_signal(number)
