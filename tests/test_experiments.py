@@ -148,8 +148,11 @@ def test_values_may_follow_from_what_a_row_starts_from() -> None:
 def test_the_shipped_models_see_both_kinds_of_scenes_and_start_from_the_shipped_weights() -> None:
     for object in OBJECTS:
         muon, shipped = (configure_model(PAPER, object, name) for name in ("mmgsd_muon", "shipped"))
-        more = {"heads": True, "clutter": True, "also": "workspace", "trunk_weights": object}
-        assert shipped == dataclasses.replace(muon, **more)
+        more = {"heads": True, "clutter": True, "also": "workspace", "trunk_weights": f"{object}-paper"}
+        going_on = {
+            name: getattr(shipped, name) for name in ("steps", "learning_rate", "sigma_start_px", "prototype_weight")
+        }
+        assert shipped == dataclasses.replace(muon, **more, **going_on) and shipped.steps < muon.steps
 
 
 def test_what_robustness_brings_is_added_one_by_one_at_the_equal_budget() -> None:

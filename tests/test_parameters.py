@@ -88,7 +88,8 @@ def list_assigned(source: str) -> list[str]:
     return [statement.targets[0].id for statement in ast.parse(source).body]
 
 
-STAGES = [path.stem for path in NOTEBOOKS if path.stem[0].isdigit()]
+OF_NO_PRESET = ("12_other_pictures",)  # it shows what was measured on the images of two
+STAGES = [path.stem for path in NOTEBOOKS if path.stem[0].isdigit() and path.stem not in OF_NO_PRESET]
 SMOKE = {"preset": "smoke", "run": True}
 FLAGS = {
     "01_render_data": ("run", "overwrite", "only_test"), "02_inspect_data": ("run",), "03_train": ("run", "overwrite"),

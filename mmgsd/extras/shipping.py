@@ -21,6 +21,7 @@ from mmgsd.learn.checkpoints import WEIGHTS, load_metadata, read_config, read_te
 from mmgsd.measure.calibration import calibrate_weights
 from mmgsd.measure.evaluation import read_results
 from mmgsd.measure.shipped import RESULTS, SETS
+from mmgsd.parameters import check_stored
 
 CARD = """# {title}
 
@@ -151,6 +152,7 @@ def main() -> None:
             if file.is_file():
                 print(restore_model(file, paths.model(models[key]), models[key]))
         return
+    check_stored(paths, "04_evaluate", "rmse.json")
     for (name, method), model in models.items():
         weights, measured = paths.model(model) / WEIGHTS, _find_measured(paths, name, method)
         if not weights.is_file() or not (measured or method == "shipped"):  # these are measured as they are shipped

@@ -298,7 +298,7 @@ def test_pinned_points_are_told_apart_and_cleared(page: Any) -> None:
 def test_another_method_answers_anew(page: Any) -> None:
     ask(page, 0.45, 0.45)
     before = page.locator(".mmgsd-tables").inner_text()
-    assert page.get_by_label("method").locator("option").all_inner_texts()[:2] == ["MMGSD", "SPCL"]
+    assert page.get_by_label("method").locator("option").all_inner_texts()[:3] == ["MMGSD, shipped", "MMGSD", "SPCL"]
     page.get_by_label("method").select_option(label="SPCL")
     wait_for_answer(page, before)
     assert "SPCL answered" in page.locator(".mmgsd-line").inner_text()
@@ -328,5 +328,5 @@ def test_the_picture_and_its_answer_are_saved(page: Any) -> None:
     with page.expect_download() as told:
         page.get_by_role("button", name="save JSON").click()
     (query,) = json.loads(Path(told.value.path()).read_text())
-    assert set(query) == {"xy", "modes", "entropy", "outside"}
-    assert set(query["modes"][0]) == {"xy", "weight", "spread_px", "confidence"}
+    assert set(query) == {"xy", "modes", "entropy", "outside", "on_object", "absent", "said"}
+    assert set(query["modes"][0]) == {"xy", "weight", "spread_px", "confidence", "visible"}
