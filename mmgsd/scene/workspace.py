@@ -47,6 +47,7 @@ def render_view(
     light = draw_light(rng, scene, site.side, np.append(site.middle, 0.0))
     deformed.mesh.hide_render = not present
     image, mask = render.render_image(scene, seed=int(rng.integers(2**31)))
+    present = present and bool(mask.any())  # a near thing may hide all of it
     if masked is not None:
         image[~mask] = masked
     labels = {"turn_deg": np.degrees(turn), "tilt_deg": tilt, "texture": texture, "background": ground, "light": light}
@@ -57,7 +58,7 @@ def render_view(
         visible=visible & present,
         intrinsics=camera.intrinsics,
         camera_pose=camera.pose,
-        info={**deformed.info, **labels, "things": ", ".join(things), "present": bool(present)},
+        info={**deformed.info, **labels, "things": ", ".join(things), "present": present},
     )
 
 

@@ -47,6 +47,13 @@ def test_without_the_object_nothing_is_visible_and_the_mask_is_empty(monkeypatch
     assert np.isfinite(absent.xy).all() and absent.image.std() > 1
 
 
+def test_an_object_that_something_hides_wholly_counts_as_absent(monkeypatch: pytest.MonkeyPatch) -> None:
+    image, nothing = np.full((480, 640, 3), 99, np.uint8), np.zeros((480, 640), bool)
+    monkeypatch.setattr(render, "render_image", lambda *_, **__: (image.copy(), nothing))
+    (hidden,) = render_views("rope", 1)
+    assert not hidden.visible.any() and hidden.info["present"] is False
+
+
 def test_the_same_arguments_give_the_same_pixels_in_any_process(tmp_path: Path) -> None:
     archives = []
     for threads in ("1", "2"):
