@@ -88,7 +88,7 @@ def list_assigned(source: str) -> list[str]:
     return [statement.targets[0].id for statement in ast.parse(source).body]
 
 
-OF_NO_PRESET = ("12_other_pictures",)  # it shows what was measured on the images of two
+OF_NO_PRESET = ("your_images", "12_other_pictures")  # the latter shows what was measured on the images of two
 STAGES = [path.stem for path in NOTEBOOKS if path.stem[0].isdigit() and path.stem not in OF_NO_PRESET]
 SMOKE = {"preset": "smoke", "run": True}
 FLAGS = {
@@ -100,7 +100,7 @@ FLAGS = {
 }  # fmt: skip
 WRONG = [  # notebook, parameter, what it was given, what the error says besides the parameter's name
     *((path.stem, "preset", value, PRESETS) for path in CHECKED for value in ("papr", 3, None, ["quick"])
-      if path.stem != "your_images"),
+      if path.stem not in OF_NO_PRESET),
     *((notebook, flag, value, "must be true or false") for notebook, flags in FLAGS.items() for flag in flags
       for value in ("flase", "", 2, None, [])),
     ("01_render_data", "workers", -1, "from 0 to 1024, got -1"),

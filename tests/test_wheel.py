@@ -39,11 +39,11 @@ COMMAND = "import runpy; sys.argv[0] = 'mmgsd'; runpy.run_module('mmgsd', run_na
 USE = """
 import json, mmgsd
 images = [mmgsd.read_image(path) for path in sys.argv[1:]]
-best = {}
+modes = {}
 for name in ("cloth", "rope"):
     match = mmgsd.load(name).match(*images, xy=[(235, 80)])
-    best[name] = match.best().xy.tolist()
-print(json.dumps({"file": mmgsd.__file__, "best": best}))
+    modes[name] = match.modes[0].tolist()
+print(json.dumps({"file": mmgsd.__file__, "modes": modes}))
 """
 
 
@@ -100,7 +100,8 @@ def test_answers_anywhere_with_the_light_dependencies_alone(installed: Path, tmp
     assert done.returncode == 0, done.stderr
     said = json.loads(done.stdout)
     assert Path(said["file"]).is_relative_to(installed)
-    assert all(0 <= value <= 485 for xy in said["best"].values() for value in xy[0])
+    assert {name: len(modes) for name, modes in said["modes"].items()} == {"cloth": 4, "rope": 2}
+    assert all(-1 <= value <= 486 for modes in said["modes"].values() for xy in modes for value in xy)
 
 
 def test_the_command_answers_with_an_installed_model(installed: Path, tmp_path: Path) -> None:

