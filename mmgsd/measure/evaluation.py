@@ -171,7 +171,8 @@ def _chance_answer(method: str, data: Dataset) -> Answer:
 def _describe_question(data: Dataset, config: EvaluateConfig, group: str, method: str) -> dict[str, str]:
     """What a table of answers depends on; kept in it, so that a stale one is noticed."""
     question = {"data": data.fingerprint, "config": digest(config), "group": data.group(group).name}
-    return {**question, "method": method, "measures": MEASURES}
+    labels = data.info.get("labels_sha256", "")  # they can be corrected without being rendered anew
+    return {**question, "labels": labels, "method": method, "measures": MEASURES}
 
 
 def _is_answered(out: Path, question: dict[str, str]) -> bool:

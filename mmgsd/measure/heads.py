@@ -43,7 +43,7 @@ def evaluate_heads(
     overwrite, progress, out = read_flag("overwrite", overwrite), read_flag("progress", progress), Path(out)
     matcher, data = Matcher.load(weights), load_dataset(dataset, "test")
     question = {"weights": hashlib.sha256(Path(weights).read_bytes()).hexdigest(), "data": data.fingerprint,
-                "config": digest(config)}  # fmt: skip
+                "labels": data.info.get("labels_sha256", ""), "config": digest(config)}  # fmt: skip
     if not overwrite and _is_measured(out, question):
         return out
     measures = measure_heads(matcher, data, config, progress=progress)

@@ -181,6 +181,13 @@ def test_other_weights_are_asked_again(ask_oracle: object, cloth_dataset: Path, 
     assert kept and not evaluation._is_answered(out, other)
 
 
+def test_corrected_labels_are_asked_again(cloth_dataset: Path) -> None:
+    data = load_dataset(cloth_dataset, "test")
+    corrected = dataclasses.replace(data, info={**data.info, "labels_sha256": "of other labels"})
+    before, after = (evaluation._describe_question(d, CONFIG, "", "sift") for d in (data, corrected))
+    assert before != after and before["data"] == after["data"]
+
+
 def test_overwrite_asks_again(cloth_dataset: Path, tmp_path: Path) -> None:
     out = tmp_path / "centre.parquet"
     out.write_bytes(b"stale")
