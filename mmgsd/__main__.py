@@ -69,9 +69,13 @@ def _add_measures(commands: argparse._SubParsersAction) -> None:
     heads = commands.add_parser("heads", help="measure the masks, hidden matches and absence that weights tell")
     heads.add_argument("--out", type=Path, required=True, metavar="FILE", help="the results to write (JSON)")
     heads.set_defaults(run=cli.heads)
-    for command in (calibrate, heads):
+    by = calibrate.add_mutually_exclusive_group(required=True)
+    unseen = "data sets whose test images were not trained on: by them how modes are read is chosen, too"
+    by.add_argument("--unseen", type=Path, nargs="+", metavar="FOLDER", help=unseen)
+    for command, place in ((calibrate, by), (heads, heads)):
         command.add_argument("weights", type=Path, help="a trained model (safetensors)")
-        command.add_argument("--data", type=Path, required=True, metavar="FOLDER", help="the data set trained on")
+        required = {"required": True} if place is heads else {}
+        place.add_argument("--data", type=Path, metavar="FOLDER", help="the data set trained on", **required)
 
 
 def _add_match(match: argparse.ArgumentParser) -> None:

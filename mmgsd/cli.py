@@ -195,10 +195,13 @@ def export(args: argparse.Namespace) -> None:
 
 def calibrate(args: argparse.Namespace) -> None:
     """Fit what ellipses, radii and confidences promise, and keep it in the file of weights."""
-    from mmgsd.measure.calibration import calibrate_weights
+    from mmgsd.measure.calibration import calibrate_unseen, calibrate_weights
 
-    found = mmgsd.load(calibrate_weights(args.weights, args.data, overwrite=args.overwrite)).calibration
-    print(f"{args.weights}: calibrated on {found.pairs} pairs of held-out simulations; each half by the other: "
+    calibrated = calibrate_weights if args.data else calibrate_unseen
+    matcher = mmgsd.load(calibrated(args.weights, args.data or args.unseen, overwrite=args.overwrite))
+    found, reading = matcher.calibration, matcher.reading
+    print(f"{args.weights}: modes read with power {reading.power:g} and sharpness {reading.sharpness:g}; "
+          f"calibrated on {found.pairs} pairs of held-out simulations; each half by the other: "
           f"ECE {found.ece_ellipse:.3f} of ellipses, {found.ece_confidence:.3f} of confidences")  # fmt: skip
 
 

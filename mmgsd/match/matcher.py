@@ -16,14 +16,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mmgsd.config import CONTRASTIVE, ROUNDNESS, TrainConfig, find_shipped
+from mmgsd.config import CONTRASTIVE, TrainConfig, find_shipped
 from mmgsd.images import check_aspect, check_mask, check_pixels, to_rgb
 from mmgsd.learn.heads import Outputs, look_up, weigh_cells
 from mmgsd.learn.losses import compute_squared_distances
 from mmgsd.learn.network import compute_cell_centres, find_device, fit_input_size, sample_descriptors
 from mmgsd.match.calibration import Calibration
 from mmgsd.match.match import Match
-from mmgsd.match.mixture import Mixture, check_count, check_modes, fit_modes, keep_most_probable
+from mmgsd.match.mixture import AS_IT_IS, Mixture, Reading, check_count, check_modes, fit_modes, keep_most_probable
 from mmgsd.match.weights import read_weights
 
 QUARTERS = 4  # turns of an image whose descriptors are averaged: what noise they have differs
@@ -64,7 +64,8 @@ class Matcher:
 
     def __init__(
         self, network: torch.nn.Module, config: TrainConfig, *, modes: int, size: tuple[int, int], device: str = "",
-        bandwidth: float | None = None, temperature: float = 1.0, calibration: Calibration | None = None,
+        bandwidth: float | None = None, temperature: float = 1.0, power: float = 1.0, sharpness: float = 1.0,
+        calibration: Calibration | None = None,
     ) -> None:  # fmt: skip
         check_scales(bandwidth=bandwidth, temperature=temperature)
         check_modes(modes)
@@ -74,6 +75,7 @@ class Matcher:
         self.config, self.modes, self.size = config, modes, size
         self.object = config.object  # "" where a file of weights does not say
         self.temperature, self.calibration = temperature, calibration
+        self.reading = Reading(config.roundness, power, sharpness)
         self.turns = QUARTERS if config.rotate else 1  # what was trained upright knows only upright images
         self.bandwidth = config.margin / 4 if bandwidth is None and config.method in CONTRASTIVE else bandwidth
 
@@ -254,9 +256,9 @@ class Pair:
         mask1 = None if self.mask1 is None else torch.from_numpy(self.mask1)
         cells = self.matcher.compute_heatmaps(*self.said, torch.from_numpy(points), size0, mask1=mask1)
         centres = compute_cell_centres(size1, cells.shape[-2:])
-        fitted, roundness = self.matcher.modes, self.matcher.config.roundness
+        fitted, reading = self.matcher.modes, self.matcher.reading
         scale = compute_scale(size1, self.matcher.size)
-        match = make_match(self.image0, self.image1, points, cells, centres, n, fitted=fitted, roundness=roundness,
+        match = make_match(self.image0, self.image1, points, cells, centres, n, fitted=fitted, reading=reading,
                            scale=scale)  # fmt: skip
         return dataclasses.replace(match, calibration=self.matcher.calibration, **self._look(match, sizes))
 
@@ -296,7 +298,7 @@ def find_weights(weights: Path | str) -> Path:
 
 def make_match(
     image0: np.ndarray, image1: np.ndarray, xy: np.ndarray, cells: Tensor, centres: tuple[Tensor, Tensor], n: Any, *,
-    fitted: int = 1, roundness: float = ROUNDNESS, scale: float = 1.0,
+    fitted: int = 1, reading: Reading = AS_IT_IS, scale: float = 1.0,
 ) -> Match:  # fmt: skip
     """The answer that heatmaps (S, h, w) with cell ``centres`` (w,), (h,) px hold, however they were made.
 
@@ -305,7 +307,7 @@ def make_match(
     """
     wanted = check_count(fitted if n is None else n, "n", queries=len(cells))
     fit, entropy = read_heatmap(cells, "auto" if wanted is None else wanted.clamp(min=fitted), centres,
-                                roundness=roundness)  # fmt: skip
+                                reading=reading)  # fmt: skip
     fit = fit if wanted is None else keep_most_probable(fit, wanted)
     arrays = (t.cpu().numpy() for t in (fit.modes, fit.weights, fit.covariances, entropy, fit.outside, cells))
     match = Match(image0, image1, xy, *arrays, scale=scale)
@@ -321,12 +323,12 @@ def compute_scale(size: tuple[int, int], trained: tuple[int, int]) -> float:
 
 
 def read_heatmap(
-    heatmap: Tensor, n: int | str | Tensor, centres: tuple[Tensor, Tensor], *, roundness: float = ROUNDNESS
+    heatmap: Tensor, n: int | str | Tensor, centres: tuple[Tensor, Tensor], *, reading: Reading = AS_IT_IS
 ) -> tuple[Mixture, Tensor]:
     """Mixtures of ``n`` modes and entropies (S,) in nats of heatmaps (S, h, w) with cell ``centres`` (w,), (h,) px."""
     xs, ys = (c.float().to(heatmap.device) for c in centres)
     entropy = compute_entropy(heatmap.flatten(1), float((xs[1] - xs[0]) * (ys[1] - ys[0])))
-    return fit_modes(heatmap, n, xs, ys, roundness=roundness), entropy
+    return fit_modes(heatmap, n, xs, ys, reading=reading), entropy
 
 
 def _check_size(size: tuple[int, int]) -> None:

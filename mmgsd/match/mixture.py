@@ -5,10 +5,14 @@ that share a strong mode while a weak one has none would stay there (determinist
 Networks 1998). A log-density is linear in (1, x, y, x², xy, y²), so an E-step is one matrix product with these six
 numbers of every cell, and an M-step, which needs their means, another. Where modes overlap, expectation-maximisation
 creeps: SQUAREM (Varadhan and Roland, Scandinavian Journal of Statistics 2008) leaps.
+
+Of an image unlike those that a network was taught with, part of the heatmap spreads over all of the object, and draws
+modes away from its peaks. `Reading` says how far modes follow the peaks instead.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,6 +37,30 @@ ELLIPSE = 5.991  # squared Mahalanobis distance of the ellipse that holds 95 % o
 
 
 @dataclass(frozen=True)
+class Reading:
+    """How modes are read from a heatmap; ValueError, which names it, for another value.
+
+    ``roundness``: heatmap mass by which modes are a priori round and equally wide, greater than 0. ``power``, at least
+    1: they are fitted to the heatmap raised to it. ``sharpness``, at least 1: each then lies at the mean of its share
+    of the heatmap raised to it. Weights and covariances are those of the shares of the heatmap itself.
+    """
+
+    roundness: float = ROUNDNESS
+    power: float = 1.0
+    sharpness: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.roundness < math.inf:
+            raise ValueError(f"roundness must be greater than 0, got {self.roundness!r}")
+        for name in ("power", "sharpness"):
+            if not 1 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)!r}")
+
+
+AS_IT_IS = Reading()  # modes at the means of their shares
+
+
+@dataclass(frozen=True)
 class Mixture:
     """Gaussian mixtures fitted to S heatmaps, most probable mode first; absent modes have weight 0, else NaN."""
 
@@ -49,20 +77,18 @@ def fit_modes(
     ys: Tensor,
     *,
     cycles: int = CYCLES,
-    roundness: float = ROUNDNESS,
+    reading: Reading = AS_IT_IS,
 ) -> Mixture:
     """Fit an n-modal Gaussian mixture to each heatmap by weighted expectation-maximisation.
 
     ``heatmap`` (S, h, w) not negative, ``n`` modes for all or (S,), or "auto" for what the Bayesian information
     criterion prefers; ``xs`` (w,) and ``ys`` (h,) cell centres in px. Symmetric modes are a priori equally likely,
-    round and equally wide, the latter two by a heatmap mass of ``roundness``: that decides which cell belongs to which
-    mode, while the result holds the moments of the mass itself. Raises ValueError for other shapes, ``n`` that is not
-    from 1 to `MAX_MODES`, another word, values that are not finite, or ``roundness`` that is not greater than 0.
+    round and equally wide, the latter two as far as ``reading`` says: that decides which cell belongs to which mode,
+    while the result holds the moments of the mass itself. Raises ValueError for other shapes, ``n`` that is not from 1
+    to `MAX_MODES`, another word, or values that are not finite.
     """
     n, n_max = _check_fit(heatmap, n, xs, ys)
-    if not 0 < roundness < np.inf:
-        raise ValueError(f"roundness must be greater than 0, got {roundness!r}")
-    how = cycles, roundness
+    how = cycles, reading.roundness
     heatmap = heatmap.float()
     total = heatmap.flatten(1).sum(-1, keepdim=True)
     if not total.isfinite().all():
@@ -70,7 +96,9 @@ def fit_modes(
     mass = torch.where(total > 0, heatmap.flatten(1) / total.clamp(min=1e-30), 1 / (len(xs) * len(ys)))
     grid = heatmap.shape[1:]
     mass = _interpolate(mass, grid)
-    state = _choose_fit(mass, grid, *how) if n is None else _fit(mass, n, n_max, grid, *how)
+    powered = _raise(mass, reading.power)
+    state = _choose_fit(powered, grid, *how) if n is None else _fit(powered, n, n_max, grid, *how)
+    state = _measure_shares(mass, state, grid, reading)
     outside = _measure_outside(mass, state, grid)
     order = state[..., 2].argsort(-1, descending=True)
     state = state.gather(1, order[..., None].expand_as(state))
@@ -99,6 +127,32 @@ def _fit(mass: Tensor, n: Tensor, n_max: int, grid: tuple[int, int], cycles: int
     state[..., 0] += 0.5 * (grid[1] % 2)  # an odd grid was halved with a column, or a row, of nothing
     state[..., 1] += 0.5 * (grid[0] % 2)
     return _run_em(mass, state, _describe_cells(grid, mass.device), cycles, roundness)
+
+
+def _raise(mass: Tensor, power: float) -> Tensor:
+    """(S, C) mass to the power, its sum 1."""
+    if power == 1:
+        return mass
+    raised = (mass / mass.amax(-1, keepdim=True).clamp(min=1e-30)) ** power
+    return raised / raised.sum(-1, keepdim=True)
+
+
+def _measure_shares(mass: Tensor, state: Tensor, grid: tuple[int, int], reading: Reading) -> Tensor:
+    """State with the weights and covariances of the components' shares of the mass, and the means of sharper ones."""
+    if reading.power == reading.sharpness == 1:
+        return state
+    size, cells = _get_chunk(state.shape[1], mass), _describe_cells(grid, mass.device)
+    parts = zip(mass.split(size), state.split(size), strict=True)
+    return torch.cat([_measure_part(*part, cells, reading.sharpness) for part in parts])
+
+
+def _measure_part(mass: Tensor, state: Tensor, cells: Tensor, sharpness: float) -> Tensor:
+    found = _compute_moments(mass, state, cells)
+    share = torch.softmax(_compute_log_densities(state, cells), 1).mul_(mass[:, None])  # (S, N, C)
+    sharp = (share / share.amax(-1, keepdim=True).clamp(min=1e-30)) ** sharpness
+    mean = (sharp @ cells[1:3].T) / sharp.sum(-1, keepdim=True).clamp(min=1e-9)
+    mean = torch.where(found[..., 2:3] > 1e-9, mean, state[..., :2])
+    return torch.cat([mean, state[..., 2:3], found[..., 3:]], -1)
 
 
 def _get_chunk(n_max: int, mass: Tensor) -> int:

@@ -17,6 +17,7 @@ from mmgsd.match.calibration import parse_calibration
 
 FORMAT = "mmgsd-1"
 PICKLES = (b"PK\x03\x04", b"\x80")  # how PyTorch's own files begin
+NUMBERS = ("bandwidth", "temperature", "power", "sharpness")  # settings that not every file has
 LARGEST = {"input_px": 8192, "descriptor_dim": 4096}  # of a configuration; more would not fit a memory
 ACCEPTED = {  # what a value of the metadata must be
     "config": "a JSON object, the training's configuration",
@@ -24,6 +25,8 @@ ACCEPTED = {  # what a value of the metadata must be
     "size": "[width, height] px",
     "bandwidth": "a number greater than 0",
     "temperature": "a number greater than 0",
+    "power": "a number of at least 1",
+    "sharpness": "a number of at least 1",
     "calibration": "what `python -m mmgsd calibrate` writes, tables of numbers that ascend",
 }
 
@@ -34,7 +37,7 @@ class Weights:
 
     network: torch.nn.Module
     config: TrainConfig
-    settings: dict[str, Any]  # modes, size, and where they are stored bandwidth, temperature, calibration
+    settings: dict[str, Any]  # modes, size, and where they are stored `NUMBERS` and calibration
     object: str  # what was taught, "" where the file does not say
 
 
@@ -56,7 +59,7 @@ def read_weights(path: Path | str) -> Weights:
                          f"not {FORMAT!r}")  # fmt: skip
     config, known = _read_config(path, metadata)
     settings = {"modes": _read(path, metadata, "modes", int), "size": _read(path, metadata, "size", _parse_size)}
-    settings |= {name: _read(path, metadata, name, float) for name in ("bandwidth", "temperature") if name in metadata}
+    settings |= {name: _read(path, metadata, name, float) for name in NUMBERS if name in metadata}
     if "calibration" in metadata:
         settings["calibration"] = _read(path, metadata, "calibration", parse_calibration)
     return Weights(_make_network(path, config, state), config, settings, config.object if known else "")

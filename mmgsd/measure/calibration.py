@@ -1,6 +1,7 @@
 """Calibration on simulations that were held out from training: a heatmap's scale, and what modes promise.
 
-    python -m mmgsd calibrate WEIGHTS --data FOLDER    adds it to weights that are trained; their tensors stay the same
+    python -m mmgsd calibrate WEIGHTS --data FOLDER         adds it to weights that are trained; their tensors stay
+    python -m mmgsd calibrate WEIGHTS --unseen FOLDER …     by images of other simulations, how modes are read as well
 
 The tables of a `Calibration` are read from all pairs; its errors are those of each half by the tables of the other.
 """
@@ -8,6 +9,8 @@ The tables of a `Calibration` are read from all pairs; its errors are those of e
 from __future__ import annotations
 
 import dataclasses
+import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,11 +20,12 @@ from scipy.optimize import minimize, minimize_scalar
 
 from mmgsd.checks import read_count, read_flag
 from mmgsd.config import EvaluateConfig
-from mmgsd.dataset import Dataset, hold_out, join_datasets, load_parts, sample_pairs
+from mmgsd.dataset import Dataset, hold_out, join_datasets, load_dataset, load_parts, sample_pairs
 from mmgsd.learn.checkpoints import load_metadata, read_tensors, write_tensors
 from mmgsd.match.calibration import LEVELS, Calibration, Modes, compute_unit, parse_calibration
 from mmgsd.match.matcher import Matcher
 from mmgsd.measure.questions import ask, choose_points, describe, measure_mean_error, model_answer
+from mmgsd.measure.reading import choose_reading
 from mmgsd.measure.uncertainty import (
     RADII_PX,
     compute_confidence_error,
@@ -47,8 +51,7 @@ def calibrate_weights(
     the folder trained on. FileNotFoundError where there is none; ValueError for weights of other data, for those whose
     held-out images make too few ``pairs``, and for a file that is damaged or not ours.
     """
-    overwrite, progress = read_flag("overwrite", overwrite), read_flag("progress", progress)
-    pairs, points = read_count("pairs", pairs, least=LEAST_PAIRS), read_count("points", points, least=1)
+    overwrite = read_flag("overwrite", overwrite)
     weights = Path(weights)
     matcher, note = Matcher.load(weights), load_metadata(weights)
     if matcher.calibration is not None and not overwrite:
@@ -59,11 +62,49 @@ def calibrate_weights(
         raise ValueError(f"dataset must be the one that {weights} was trained on, of fingerprint {note.get('data')}: "
                          f"{dataset} has {data.fingerprint}")  # fmt: skip
     held_out = join_datasets(*(hold_out(part)[1] for part in parts))
-    found = calibrate_modes(matcher, held_out, pairs=pairs, points=points, progress=progress)
+    found = _calibrate(matcher, held_out, "dataset must hold out", pairs=pairs, points=points, progress=progress)
+    return _keep(weights, {"calibration": found})
+
+
+def calibrate_unseen(
+    weights: Path | str, unseen: Sequence[Path | str], *, pairs: int = PAIRS, points: int = 40, overwrite: bool = False,
+    progress: bool = True,
+) -> Path:  # fmt: skip
+    """The same by the test images of data sets that were not trained on, from which a reading is chosen first.
+
+    ``unseen`` are their folders, one or more, of other seeds than those that the weights are measured on. The reading
+    (`mmgsd.measure.reading.choose_reading`) is kept as ``power`` and ``sharpness``, the fingerprints as ``unseen``.
+    Errors are those of `calibrate_weights`, and ValueError where a data set is that of the training.
+    """
+    overwrite, weights = read_flag("overwrite", overwrite), Path(weights)
+    matcher, note = Matcher.load(weights), load_metadata(weights)
+    if "unseen" in note and not overwrite:
+        return weights
+    parts = [load_dataset(place, "test") for place in unseen]
+    for part in parts:
+        if part.fingerprint == note.get("data"):
+            raise ValueError(f"unseen must be data sets that {weights} was not trained on, got that: {part.folder}")
+    data = join_datasets(*parts)
+    how = {"points": points, "progress": progress}
+    reading = choose_reading(matcher, data, progress=read_flag("progress", progress))
+    found = _calibrate(matcher, data, "unseen must hold test", pairs=pairs, **how)
+    chosen = {"power": repr(reading.power), "sharpness": repr(reading.sharpness)}
+    return _keep(weights, {**chosen, "calibration": found, "unseen": json.dumps([p.fingerprint for p in parts])})
+
+
+def _calibrate(matcher: Matcher, data: Dataset, accepted: str, *, pairs: int, points: int, progress: bool) -> str:
+    """What the modes hold on ``data``, as metadata; ValueError of too few images."""
+    pairs, points = read_count("pairs", pairs, least=LEAST_PAIRS), read_count("points", points, least=1)
+    found = calibrate_modes(matcher, data, pairs=pairs, points=points, progress=read_flag("progress", progress))
     if found is None:
-        raise ValueError(f"dataset must hold out images for at least {LEAST_PAIRS} pairs, got {len(held_out)} images")
+        raise ValueError(f"{accepted} images for at least {LEAST_PAIRS} pairs, got {len(data)} images")
+    return found.to_json()
+
+
+def _keep(weights: Path, found: dict[str, str]) -> Path:
+    """Add to a file's metadata; its tensors stay."""
     tensors, note = read_tensors(weights)
-    return write_tensors(weights, tensors, note | {"calibration": found.to_json()})
+    return write_tensors(weights, tensors, note | found)
 
 
 def read_calibration(weights: Path | str) -> Calibration | None:

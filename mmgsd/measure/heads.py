@@ -118,7 +118,7 @@ def _find_modes(
     """Modes (S, n, 2) px of source pixels (S, 2)."""
     heatmap = matcher.compute_heatmaps(said0, said1, xy, size)
     centres = compute_cell_centres(size, heatmap.shape[-2:])
-    return read_heatmap(heatmap, n, centres, roundness=matcher.config.roundness)[0].modes
+    return read_heatmap(heatmap, n, centres, reading=matcher.reading)[0].modes
 
 
 def _is_measured(out: Path, question: dict[str, Any]) -> bool:

@@ -18,7 +18,7 @@ from mmgsd.learn.network import build_network, compute_cell_centres
 from mmgsd.match import matcher as matching
 from mmgsd.match.baselines import BaselineMatcher
 from mmgsd.match.matcher import Matcher, compute_entropy, compute_heatmap, load, make_match
-from mmgsd.match.mixture import Mixture
+from mmgsd.match.mixture import Mixture, Reading
 from mmgsd.measure.metrics import compute_query_errors
 
 CONFIG = TrainConfig(input_px=64, descriptor_dim=8)
@@ -67,16 +67,17 @@ def matcher() -> Matcher:
 def test_modes_are_read_as_round_as_the_training_says(matcher: Matcher, monkeypatch: pytest.MonkeyPatch) -> None:
     asked, fit = [], matching.fit_modes
 
-    def listen(*arguments: object, roundness: float) -> Mixture:
-        asked.append(roundness)
-        return fit(*arguments, roundness=roundness)
+    def listen(*arguments: object, reading: Reading) -> Mixture:
+        asked.append(reading)
+        return fit(*arguments, reading=reading)
 
     monkeypatch.setattr(matching, "fit_modes", listen)
     image = np.zeros((64, 64, 3), np.uint8)
     matcher.match(image, image, [(5, 5)])
-    monkeypatch.setattr(matcher, "config", dataclasses.replace(CONFIG, roundness=0.07))
-    matcher.match(image, image, [(5, 5)])
-    assert asked == [0.2, 0.07]
+    config = dataclasses.replace(CONFIG, roundness=0.07)
+    other = Matcher(matcher.network, config, modes=4, size=SIZE, device="cpu", power=1.5, sharpness=3.0)
+    other.match(image, image, [(5, 5)])
+    assert asked == [Reading(0.2), Reading(0.07, 1.5, 3.0)]
 
 
 @pytest.fixture
@@ -107,7 +108,8 @@ def test_match_has_the_promised_form(matcher: Matcher, rng: np.random.Generator)
 
 def test_modes_follow_the_targets_size(matcher: Matcher, image: np.ndarray) -> None:
     double = np.repeat(np.repeat(image, 2, axis=0), 2, axis=1)
-    one, two = (matcher.match(image, target, xy=[(50, 60)], n=1).modes[0, 0] for target in (image, double))
+    sure = Matcher(matcher.network, CONFIG, modes=4, size=SIZE, device="cpu", temperature=0.01)  # of one peak
+    one, two = (sure.match(image, target, xy=[(50, 60)], n=1).modes[0, 0] for target in (image, double))
     np.testing.assert_allclose((two + 0.5) / 2 - 0.5, one, atol=0.5)
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from mmgsd.learn.network import compute_cell_centres
 from mmgsd.match import mixture
-from mmgsd.match.mixture import fit_modes
+from mmgsd.match.mixture import Reading, fit_modes
 from mmgsd.measure.metrics import compute_mode_errors
 
 
@@ -56,14 +56,46 @@ def test_weights_are_found_and_sorted() -> None:
 def test_less_of_a_prior_keeps_a_narrow_mode_out_of_a_wide_one() -> None:
     true = np.array([[200.0, 240.0], [290.0, 240.0]])
     heatmap = (draw_mixture(true[:1], 8.0) + draw_mixture(true[1:], 60.0)) / 2
-    errors = [measure_errors(fit_modes(heatmap, 2, XS, YS, roundness=r).modes[0], true) for r in (0.05, 0.2, 5.0)]
+    errors = [
+        measure_errors(fit_modes(heatmap, 2, XS, YS, reading=Reading(r)).modes[0], true) for r in (0.05, 0.2, 5.0)
+    ]
     assert errors[0].max() < errors[1].max() < errors[2].max()
 
 
 @pytest.mark.parametrize("roundness", [0.0, -1.0, float("nan")])
 def test_another_roundness_is_refused(roundness: float) -> None:
     with pytest.raises(ValueError, match="roundness must be greater than 0, got"):
-        fit_modes(one_cell(3, 3), 1, XS, YS, roundness=roundness)
+        Reading(roundness)
+
+
+@pytest.mark.parametrize("name", ["power", "sharpness"])
+@pytest.mark.parametrize("value", [0.9, 0.0, float("nan"), float("inf")])
+def test_modes_are_not_read_flatter_than_they_are(name: str, value: float) -> None:
+    with pytest.raises(ValueError, match=f"{name} must be at least 1, got"):
+        Reading(**{name: value})
+
+
+def draw_tails() -> torch.Tensor:
+    """Four lobes, each with half of its mass in a tail towards the middle, and a fifth of all spread evenly."""
+    tails = CORNERS + 0.25 * (CORNERS.mean(0) - CORNERS)
+    heatmap = 0.4 * draw_mixture(CORNERS, 8.0) + 0.4 * draw_mixture(tails, 20.0)
+    return heatmap + 0.2 / heatmap[0].numel()
+
+
+def test_modes_follow_the_peaks_of_what_spreads_to_one_side() -> None:
+    readings = [Reading(), Reading(sharpness=4.0), Reading(power=2.0, sharpness=4.0)]
+    fits = [fit_modes(draw_tails(), 4, XS, YS, reading=reading) for reading in readings]
+    plain, *others = (measure_errors(fit.modes[0], CORNERS).max() for fit in fits)
+    assert plain > 20 and max(others) < 2
+    assert fits[2].weights.sum() == pytest.approx(1, abs=1e-5)
+    trace = [float(torch.diagonal(fit.covariances[0], dim1=-2, dim2=-1).sum(-1).mean()) for fit in fits]
+    assert trace[1] == pytest.approx(trace[0], rel=0.05)  # spreads stay those of the heatmap itself
+
+
+def test_absent_modes_stay_absent_however_modes_are_read() -> None:
+    heatmaps = torch.cat([draw_mixture(CORNERS, 8.0), draw_mixture(CORNERS[:1], 8.0)])
+    fit = fit_modes(heatmaps, torch.tensor([4, 1]), XS, YS, reading=Reading(power=2.0, sharpness=3.0))
+    assert fit.modes[1].isnan().sum(0).tolist() == [3, 3] and fit.weights[1].tolist() == [1, 0, 0, 0]
 
 
 def test_a_weak_mode_beside_a_strong_one_is_found() -> None:

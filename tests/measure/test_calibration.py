@@ -18,12 +18,14 @@ from mmgsd.learn.checkpoints import load_metadata, read_tensors, write_tensors
 from mmgsd.learn.network import build_network, compute_cell_centres
 from mmgsd.match.calibration import LEVELS
 from mmgsd.match.matcher import Matcher
+from mmgsd.match.mixture import Reading
 from mmgsd.measure import calibration
 from mmgsd.measure.calibration import (
     BANDWIDTHS,
     calibrate_bandwidth,
     calibrate_modes,
     calibrate_temperature,
+    calibrate_unseen,
     calibrate_weights,
     check_calibration,
     find_quantiles,
@@ -124,6 +126,33 @@ def test_calibrated_weights_are_left_alone_unless_asked(
     assert weights.stat().st_mtime_ns == stamp
     calibrate_weights(weights, cloth_dataset, overwrite="yes", **how)
     assert weights.stat().st_mtime_ns > stamp and load_metadata(weights) == before
+
+
+def test_unseen_images_choose_how_modes_are_read_as_well(
+    weights: Path, cloth_dataset: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tensors, note = read_tensors(weights)
+    write_tensors(weights, tensors, note | {"data": "0123"})
+
+    def choose(matcher: Matcher, *_: object, **__: object) -> Reading:
+        matcher.reading = Reading(0.2, 1.5, 4.0)
+        return matcher.reading
+
+    monkeypatch.setattr(calibration, "choose_reading", choose)
+    monkeypatch.setattr(calibration, "LEAST_PAIRS", 8)  # of four images
+    how = {"pairs": 12, "points": 4, "progress": False}
+    calibrate_unseen(weights, [cloth_dataset], **how)
+    matcher, said = Matcher.load(weights, device="cpu"), load_metadata(weights)
+    assert matcher.reading == Reading(0.2, 1.5, 4.0) and matcher.calibration.pairs >= 8
+    assert json.loads(said["unseen"]) == [load_dataset(cloth_dataset, "test").fingerprint]
+    stamp = weights.stat().st_mtime_ns
+    calibrate_unseen(weights, [cloth_dataset], **how)
+    assert weights.stat().st_mtime_ns == stamp
+
+
+def test_images_trained_on_are_not_unseen(weights: Path, cloth_dataset: Path) -> None:
+    with pytest.raises(ValueError, match="unseen must be data sets that .*w.safetensors was not trained on, got that"):
+        calibrate_unseen(weights, [cloth_dataset], progress=False)
 
 
 def test_weights_of_other_data_are_not_calibrated(weights: Path, cloth_dataset: Path) -> None:

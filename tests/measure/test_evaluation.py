@@ -16,7 +16,7 @@ from mmgsd.config import EvaluateConfig, TrainConfig
 from mmgsd.dataset import Dataset, load_dataset
 from mmgsd.learn.network import build_network
 from mmgsd.match.matcher import Matcher
-from mmgsd.match.mixture import Mixture
+from mmgsd.match.mixture import Mixture, Reading
 from mmgsd.measure import evaluation, questions
 from mmgsd.measure.evaluation import (
     BASELINES,
@@ -234,9 +234,9 @@ def test_modes_are_read_as_round_as_the_training_says(cloth_dataset: Path, monke
     matcher = Matcher(build_network("lite0", 4, pretrained=False), config, modes=4, size=(485, 485), device="cpu")
     asked, read = [], questions.read_heatmap
 
-    def listen(*arguments: object, roundness: float) -> tuple[Mixture, torch.Tensor]:
-        asked.append(roundness)
-        return read(*arguments, roundness=roundness)
+    def listen(*arguments: object, reading: Reading) -> tuple[Mixture, torch.Tensor]:
+        asked.append(reading.roundness)
+        return read(*arguments, reading=reading)
 
     monkeypatch.setattr(questions, "read_heatmap", listen)
     measure_rmse(matcher, load_dataset(cloth_dataset), pairs=2, points=5)

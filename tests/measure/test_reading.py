@@ -1,0 +1,62 @@
+"""How modes are read is chosen by what a robot can grasp on held-out renders."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from mmgsd.config import TrainConfig
+from mmgsd.dataset import load_dataset
+from mmgsd.learn.network import build_network
+from mmgsd.match.matcher import Matcher
+from mmgsd.match.mixture import Reading
+from mmgsd.measure import reading
+from mmgsd.measure.reading import ALLOWED, POWERS, SHARPNESSES, Asked, Quality, choose_reading, count_seen
+
+
+@pytest.fixture
+def matcher() -> Matcher:
+    torch.manual_seed(0)
+    config = TrainConfig(input_px=64, descriptor_dim=4)
+    return Matcher(build_network("lite0", 4, pretrained=False), config, modes=4, size=(485, 485), device="cpu")
+
+
+def test_only_matches_that_are_seen_count() -> None:
+    true = np.array([[[0.0, 0], [100, 0], [0, 100], [100, 100]]]).repeat(3, 0)
+    seen = np.array([[True, True, False, False], [True, True, True, False], [False] * 4])
+    modes = true.copy()
+    modes[0, 1] = 100, 30  # neither near a seen match nor far from all
+    modes[1, :2] = (50, 50), (0, 19)  # the first is far from all three, the second near one
+    found, spurious = count_seen(modes, true, seen)
+    np.testing.assert_allclose(found, [1 / 2, 2 / 3])  # the third query has nothing to be found
+    np.testing.assert_allclose(spurious, [0, 1 / 3])
+
+
+def test_a_reading_that_costs_too_much_error_is_not_chosen(
+    matcher: Matcher, cloth_dataset: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def measure(asked: list[Asked], tried: Reading, size: tuple[int, int]) -> Quality:
+        return Quality(10 * (1 + 0.01 * (tried.power - 1) * tried.sharpness), 0.1 * tried.power * tried.sharpness, 0.0)
+
+    monkeypatch.setattr(reading, "measure_reading", measure)
+    chosen = choose_reading(matcher, load_dataset(cloth_dataset, "test"), pairs=2, points=4)
+    assert chosen == matcher.reading == Reading(matcher.config.roundness, 1.5, 8.0)
+    assert 1 + 0.01 * 0.5 * 8 <= ALLOWED < 1 + 0.01 * 8
+
+
+def test_a_reading_is_chosen_by_images(matcher: Matcher, cloth_dataset: Path) -> None:
+    data = load_dataset(cloth_dataset, "test")
+    chosen = choose_reading(matcher, data, pairs=2, points=9)
+    assert chosen.power in POWERS and chosen.sharpness in SHARPNESSES
+    assert chosen == choose_reading(matcher, data, pairs=2, points=9)
+
+
+def test_the_points_of_a_symmetrys_centre_are_not_asked(matcher: Matcher, cloth_dataset: Path) -> None:
+    data = load_dataset(cloth_dataset, "test")
+    config = reading.EvaluateConfig(pairs=2, points=625)
+    for asked in reading._ask(matcher, data, config):
+        assert asked.heatmaps.shape[0] == len(asked.true) == len(asked.seen) <= 624
+        assert asked.true.shape[1:] == (4, 2)
