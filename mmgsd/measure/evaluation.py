@@ -18,7 +18,7 @@ from mmgsd.dataset_format import UNREADABLE
 from mmgsd.files import DamagedFileError, read_json, saying_what_stays, set_aside, write_json, writing
 from mmgsd.match.baselines import BASELINES, BaselineMatcher
 from mmgsd.match.matcher import Matcher, check_scales, read_heatmap
-from mmgsd.match.mixture import Mixture, check_modes
+from mmgsd.match.mixture import Mixture, Reading, check_modes
 from mmgsd.measure.metrics import aggregate
 from mmgsd.measure.questions import Answer, ask, model_answer
 
@@ -29,7 +29,7 @@ MEASURES = "3"  # to be raised where the same answers are measured in another wa
 
 def evaluate_model(
     weights: Path, dataset: Path, config: EvaluateConfig, out: Path, *, group: str = "", modes: int = 0,
-    temperature: float | None = None, overwrite: bool = False, progress: bool = True,
+    temperature: float | None = None, reading: Reading | None = None, overwrite: bool = False, progress: bool = True,
 ) -> Path:  # fmt: skip
     """Ask a trained model all queries and write the table ``out`` (Parquet).
 
@@ -37,7 +37,8 @@ def evaluate_model(
 
     The true matches are those of ``group`` ("" is the object's own), whatever the model was taught. As many modes are
     fitted as a query has true matches, but at least ``modes``: of these the most probable ones are the answer.
-    ``temperature`` of the heatmaps is the model's own, calibrated one unless given. ValueError for ``modes`` that are
+    ``temperature`` of the heatmaps is the model's own, calibrated one unless given, and so is the ``reading`` of their
+    modes. ValueError for ``modes`` that are
     not from 0 to `mmgsd.config.MAX_MODES`, for another ``temperature`` than a number above 0, and for weights that
     were taught another object than the data set shows.
     """
@@ -50,12 +51,14 @@ def evaluate_model(
     method = hashlib.sha256(Path(weights).read_bytes()).hexdigest()
     method += "" if temperature is None else f" at temperature {temperature:g}"
     method += f" of {modes} modes" if modes else ""
+    method += f" by {reading}" if reading else ""
     question = _describe_question(data, config, group, method)
     if not overwrite and _is_answered(out, question):
         return out
     matcher = Matcher.load(weights)
     if temperature is not None:
         matcher.temperature = temperature
+    matcher.reading = reading or matcher.reading
     answer = model_answer(matcher, data, config)
     return _answer_all(answer, data, config, group, out, question, progress, modes)
 

@@ -1,16 +1,19 @@
 """What shipped weights, and what one would pick instead, do on clean renders, on cluttered ones and on photographs.
 
     python -m mmgsd.measure.shipped cloth cloth-paper daisy --photographs FOLDER    -> data/results/shipped.json
+    python -m mmgsd.measure.shipped cloth@1,1 --photographs FOLDER     its modes read with another power and sharpness
     python -m mmgsd.measure.shipped robustness --photographs FOLDER    the models of that study, once they are trained
 
 A row a name: of weights in data/weights; of a baseline, which is asked about each object with the true masks, and in
-photographs with those that the shipped weights see; or of each model of the study `STUDY` of the preset `paper`. The
+photographs with those that the shipped weights see; or of each model of the study `STUDY` of the preset `paper`. How
+modes are read (`mmgsd.match.mixture.Reading`) is the weights' own, unless the name says another after an @. The
 test images of the presets `SETS` have to be rendered. Tables of answers are kept, so that a killed call goes on.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import hashlib
 import statistics
 import time
@@ -32,6 +35,7 @@ from mmgsd.match.baselines import BASELINES, BaselineMatcher, FeatureMatcher
 from mmgsd.match.calibration import Calibration
 from mmgsd.match.match import RADIUS_PX, Match
 from mmgsd.match.matcher import Matcher, find_weights
+from mmgsd.match.mixture import Reading
 from mmgsd.measure.evaluation import evaluate_baseline, evaluate_model, load_queries, read_results
 from mmgsd.measure.heads import MEASURES as HEADS
 from mmgsd.measure.heads import evaluate_heads
@@ -65,7 +69,8 @@ def measure_weights(
     file = weights or find_weights(name)
     matcher = Matcher.load(file)
     row = {"object": matcher.object, "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
-           "calibrated": matcher.calibration is not None}  # fmt: skip
+           "calibrated": matcher.calibration is not None, "power": matcher.reading.power,
+           "sharpness": matcher.reading.sharpness}  # fmt: skip
     for preset in SETS:
         paths = Paths(root, preset)
         data, config = paths.dataset(matcher.object), load_preset(preset).evaluate
@@ -76,6 +81,38 @@ def measure_weights(
     if photographs:
         row["photographs"] = measure_photographs(file, photographs, progress=progress)
     return row | _time_question(matcher, root)
+
+
+def measure_read(name: str, root: Path, *, photographs: Path | None = None, progress: bool = True) -> dict[str, Any]:
+    """The row of shipped weights whose modes are read otherwise: "cloth@1,1" with power 1 and sharpness 1, at means.
+
+    `mmgsd.measure.metrics.aggregate` over visible sources of each of `SETS`, and photographs. ValueError for other
+    numbers, FileNotFoundError for other weights.
+    """
+    weights, _, numbers = name.partition("@")
+    file = find_weights(weights)
+    matcher = Matcher.load(file)
+    reading = matcher.reading = parse_reading(numbers, matcher.reading)
+    row: dict[str, Any] = {"object": matcher.object, "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
+                           "power": reading.power, "sharpness": reading.sharpness}  # fmt: skip
+    for preset in SETS:
+        paths = Paths(root, preset)
+        data, out = paths.dataset(matcher.object), paths.queries(f"shipped-{name}")
+        queries = load_queries(evaluate_model(file, data, load_preset(preset).evaluate, out, reading=reading,
+                                              progress=progress))  # fmt: skip
+        row[preset] = aggregate(queries[queries.visible])
+    if photographs:
+        row["photographs"] = measure_answers(matcher, read_photographs(photographs, matcher.object), progress=progress)
+    return row
+
+
+def parse_reading(text: str, like: Reading) -> Reading:
+    """The reading that "power,sharpness" says, as round as ``like``; ValueError for anything else."""
+    try:
+        power, sharpness = map(float, text.split(","))
+    except ValueError:
+        raise ValueError(f"a reading must be POWER,SHARPNESS, two numbers from 1 on, got {text!r}") from None
+    return dataclasses.replace(like, power=power, sharpness=sharpness)
 
 
 def _summarise(table: Path, matcher: Matcher) -> dict[str, Any]:
@@ -143,6 +180,8 @@ def _measure(name: str, root: Path, photographs: Path | None) -> dict[str, dict[
     how = {"photographs": photographs}
     if name in BASELINES:
         return {f"{object}-{name}": measure_baseline(name, object, root, **how) for object in OBJECTS}
+    if "@" in name:
+        return {name: measure_read(name, root, **how)}
     if name != STUDY:
         return {name: measure_weights(name, root, **how)}
     preset, paths = load_preset(SETS[0]), Paths(root, SETS[0])
@@ -160,7 +199,10 @@ def main() -> None:
     """Measure some weights and baselines and put their rows into the results."""
     parser = argparse.ArgumentParser(prog="python -m mmgsd.measure.shipped", description=__doc__.split("\n")[0])
     parser.add_argument(
-        "names", nargs="+", metavar="NAME", help=f"weights in data/weights, {', '.join(BASELINES)}, or {STUDY}"
+        "names",
+        nargs="+",
+        metavar="NAME",
+        help=f"weights in data/weights, alone or with @POWER,SHARPNESS, {', '.join(BASELINES)}, or {STUDY}",
     )
     parser.add_argument("--photographs", type=Path, metavar="FOLDER", help="marked photographs, with index.json")
     args = parser.parse_args()

@@ -44,7 +44,8 @@ def _make_pictures_lines(rows: Rows, labels: Mapping[str, str]) -> str:
         photographs = rows[name].get("photographs")
         shares = [_format(photographs, key, 100, ".0f", " %") for key in ("found@5%", "spurious")]
         best = _format(photographs, "best", 1, ".1f", " %")
-        lines.append(_join([f"{name.partition('-')[0]}, {label}", *errors, *shares, best]))
+        object = name.partition("@")[0].partition("-")[0]
+        lines.append(_join([f"{object}, {label}", *errors, *shares, best]))
     return "\n".join(lines)
 
 
@@ -53,6 +54,18 @@ def make_parts_table(rows: Rows) -> str:
     parts = {name: row.label for name, row in ROWS.items() if "robustness" in row.studies}
     found = {f"{object}-{name}": label for object in OBJECTS for name, label in parts.items()}
     return _make_pictures_lines(rows, {name: label for name, label in found.items() if name in rows})
+
+
+def make_readings_table(rows: Rows) -> str:
+    """`make_pictures_table` of weights whose modes are read in more than one way, power and sharpness in the label."""
+    labels = {}
+    for name in (name for name in sorted(rows) if "power" in rows[name]):
+        weights, _, numbers = name.partition("@")
+        again = any(other.startswith(f"{weights}@") for other in rows)
+        if numbers or again:
+            row = rows[name]
+            labels[name] = f"`{weights}`, power {row['power']:g}, sharpness {row['sharpness']:g}"
+    return _make_pictures_lines(rows, labels)
 
 
 def make_knowledge_table(rows: Rows) -> str:

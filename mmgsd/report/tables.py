@@ -19,6 +19,7 @@ from mmgsd.report.shipped import (
     make_knowledge_table,
     make_parts_table,
     make_pictures_table,
+    make_readings_table,
     make_sources_sentence,
 )
 
@@ -92,6 +93,7 @@ TABLES: dict[str, tuple[str | tuple[str, ...], Callable[[Any], described.Table |
     "uncertainty": ("paper/uncertainty.json", described.describe_uncertainty),
     "pictures": ("shipped.json", make_pictures_table),
     "parts": ("shipped.json", make_parts_table),
+    "readings": ("shipped.json", make_readings_table),
     "knowledge": ("shipped.json", make_knowledge_table),
     "sources": ("shipped.json", make_sources_sentence),
     "counts": ("shipped.json", make_counts_sentence),

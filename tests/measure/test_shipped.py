@@ -14,7 +14,7 @@ from test_heads_measured import write_weights
 
 from mmgsd.config import EvaluateConfig, Paths, load_preset
 from mmgsd.measure import shipped
-from mmgsd.measure.shipped import Masked, main, measure_baseline, measure_weights
+from mmgsd.measure.shipped import Masked, main, measure_baseline, measure_read, measure_weights
 
 SAMPLE = Path(__file__).parents[2] / "data" / "sample"
 
@@ -83,3 +83,23 @@ def test_a_study_that_is_not_trained_says_how_to_train_it(root: Path, monkeypatc
     monkeypatch.setattr(sys, "argv", [sys.executable, "robustness"])
     with pytest.raises(FileNotFoundError, match="run python -m mmgsd.measure.matrix paper --study robustness"):
         main()
+
+
+def test_a_name_may_say_how_modes_are_read(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", [sys.executable, "mine", "mine@1,1", "mine@2,4"])
+    main()
+    rows = json.loads((root / "data" / "results" / "shipped.json").read_text())
+    assert [(row["power"], row["sharpness"]) for row in rows.values()] == [(1, 1), (1, 1), (2, 4)]
+    own, same, other = (row["paper"]["rmse_mean"] for row in rows.values())
+    assert own == same != other
+
+
+@pytest.mark.parametrize("name", ["mine@", "mine@2", "mine@2,x", "mine@1,2,3"])
+def test_another_reading_is_two_numbers(root: Path, name: str) -> None:
+    with pytest.raises(ValueError, match="a reading must be POWER,SHARPNESS, two numbers from 1 on, got"):
+        measure_read(name, root, progress=False)
+
+
+def test_modes_are_not_read_flatter_from_a_name_either(root: Path) -> None:
+    with pytest.raises(ValueError, match="power must be at least 1, got 0.5"):
+        measure_read("mine@0.5,1", root, progress=False)

@@ -8,6 +8,7 @@ from mmgsd.report.shipped import (
     make_knowledge_table,
     make_parts_table,
     make_pictures_table,
+    make_readings_table,
     make_sources_sentence,
 )
 
@@ -47,6 +48,16 @@ def test_parts_are_told_one_after_another() -> None:
         "| rope, the same, with heads",
     ]
     assert "| 21.0 | 99.0 |" in lines[2]
+
+
+def test_ways_of_reading_stand_beside_the_weights_own() -> None:
+    means, own = {"power": 1.0, "sharpness": 1.0}, {"power": 1.5, "sharpness": 4.0}
+    rows = {"rope": {**own}, "cloth@1,1": {**means, "paper": {"rmse_mean": 25.6}}, "cloth": {**own, **ROWS["cloth"]}}
+    lines = make_readings_table(rows).splitlines()
+    assert lines[2:] == [
+        "| cloth, `cloth`, power 1.5, sharpness 4 | 21.0 | 21.0 | 51 % | 25 % | 8.0 % |",
+        "| cloth, `cloth`, power 1, sharpness 1 | 25.6 | – | – | – | – |",
+    ]
 
 
 def test_knowledge_is_of_weights_alone() -> None:
