@@ -173,10 +173,15 @@ def configure_study(
     if rows is None:
         rows = vary_sigma(preset.sigmas_px) if study == "sigma" else list_rows(study)
     base = (preset.ablation if study in SMALL else preset.train)[object]
-    models = {row.name: _configure(base, row) for row in rows if object in row.objects}
+    models = {row.name: _join_clutter(_configure(base, row), preset) for row in rows if object in row.objects}
     kept = [row.name for row in rows
             if row.name in models and (row.scene or models[row.name] != models.get(row.start))]  # fmt: skip
     return {name: dataclasses.replace(models[name], steps=steps or models[name].steps) for name in kept}
+
+
+def _join_clutter(model: TrainConfig, preset: Preset) -> TrainConfig:
+    """What learns from cluttered images besides learns from those of the preset's size."""
+    return dataclasses.replace(model, also=preset.cluttered) if model.also else model
 
 
 def configure_scene(preset: Preset, object: str, row: Model) -> RenderConfig:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from mmgsd.config import OBJECTS
+from mmgsd.config import OBJECTS, load_preset
 from mmgsd.experiments import ROWS, get_label
 from mmgsd.match.baselines import BASELINES
 
@@ -53,6 +53,14 @@ def make_parts_table(rows: Rows) -> str:
     parts = {name: row.label for name, row in ROWS.items() if "robustness" in row.studies}
     found = {f"{object}-{name}": label for object in OBJECTS for name, label in parts.items()}
     return _make_pictures_lines(rows, {name: label for name, label in found.items() if name in rows})
+
+
+def make_budget_sentence(rows: Rows) -> str:
+    """How much the models of `make_parts_table` learnt from."""
+    row = next(row for row in rows.values() if "steps" in row)
+    images = load_preset(row["preset"]).render["cloth"]
+    return (f"Preset `{row['preset']}`: {row['steps']} steps each, from {images.train_images:,} images of a kind; "
+            f"{images.test_images} test images of each.")  # fmt: skip
 
 
 def make_knowledge_table(rows: Rows) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from mmgsd.report.shipped import (
     list_names,
+    make_budget_sentence,
     make_counts_sentence,
     make_knowledge_table,
     make_parts_table,
@@ -47,6 +48,12 @@ def test_parts_are_told_one_after_another() -> None:
         "| rope, the same, with heads",
     ]
     assert "| 21.0 | 99.0 |" in lines[2]
+
+
+def test_the_parts_budget_is_said() -> None:
+    rows = ROWS | {"cloth-mmgsd": {"preset": "quick", "steps": 300}}
+    said = "Preset `quick`: 300 steps each, from 300 images of a kind; 50 test images of each."
+    assert make_budget_sentence(rows) == said
 
 
 def test_knowledge_is_of_weights_alone() -> None:
