@@ -229,7 +229,7 @@ PAPER = dict(
 QUICK = dict(
     train_images=300, test_images=50, views={"cloth": 5, "rope": 5},
     train={"network": "lite0x2", "optimiser": "muon", "steps": 225, "input_px": 96, "pairs": 40, "queries": 32},
-    rope={"input_px": 128}, ablation={"steps": 60}, sigmas=(1.0, 4.0, 16.0),
+    rope={"input_px": 128, "steps": 270}, ablation={"steps": 60}, sigmas=(1.0, 4.0, 16.0),
     evaluate={"pairs": 30, "points": 625}, cluttered="workspace_quick",
 )  # fmt: skip
 PRESETS = {
