@@ -1,4 +1,4 @@
-"""One frozen dataclass for each stage, and the presets ``smoke``, ``quick``, ``paper`` and ``workspace``.
+"""One frozen dataclass for each stage, and the presets, ``smoke``, ``quick``, ``paper`` and others.
 
 A configuration is everything that decides a result. How it is computed (workers, scheduler address, overwrite) is
 an argument of the stage, never part of its configuration.
@@ -194,11 +194,13 @@ class Preset:
     evaluate: EvaluateConfig
     ablation: dict[str, TrainConfig]  # the equal, smaller budget of the studies
     sigmas_px: tuple[float, ...]
+    cluttered: str = "workspace"  # preset of the cluttered images that go with these, where a model learns from both
 
 
 def _preset(
-    name: str, *, views: dict, train: dict, rope: dict, ablation: dict, evaluate: dict, sigmas: tuple, **render: Any
-) -> Preset:
+    name: str, *, views: dict, train: dict, rope: dict, ablation: dict, evaluate: dict, sigmas: tuple,
+    cluttered: str = "workspace", **render: Any,
+) -> Preset:  # fmt: skip
     cloth_train = TrainConfig(object="cloth", **train)
     rope_train = TrainConfig(object="rope", **{**train, **rope})
     return Preset(
@@ -208,11 +210,12 @@ def _preset(
         evaluate=EvaluateConfig(**evaluate),
         ablation={t.object: dataclasses.replace(t, **ablation) for t in (cloth_train, rope_train)},
         sigmas_px=sigmas,
+        cluttered=cluttered,
     )
 
 
 def load_preset(name: str) -> Preset:
-    """The preset ``smoke``, ``quick``, ``paper`` or ``workspace``; ValueError for any other name."""
+    """The preset of a name of `PRESETS`; ValueError, which names them, for any other."""
     check_choice("preset", name, tuple(PRESETS))
     return PRESETS[name]
 
@@ -223,6 +226,12 @@ PAPER = dict(
     ablation={"steps": 1000}, sigmas=(1.0, 2.0, 4.0, 8.0, 16.0),
     evaluate={"pairs": 500, "points": 625},
 )  # fmt: skip
+QUICK = dict(
+    train_images=300, test_images=50, views={"cloth": 5, "rope": 5},
+    train={"network": "lite0x2", "optimiser": "muon", "steps": 225, "input_px": 96, "pairs": 40, "queries": 32},
+    rope={"input_px": 128, "steps": 270}, ablation={"steps": 60}, sigmas=(1.0, 4.0, 16.0),
+    evaluate={"pairs": 30, "points": 625}, cluttered="workspace_quick",
+)  # fmt: skip
 PRESETS = {
     "smoke": _preset(
         "smoke",
@@ -231,15 +240,10 @@ PRESETS = {
         ablation={"steps": 4}, sigmas=(1.0, 16.0),
         evaluate={"pairs": 4, "points": 25},
     ),
-    "quick": _preset(
-        "quick",
-        train_images=300, test_images=50, views={"cloth": 5, "rope": 5},
-        train={"steps": 225, "input_px": 96, "pairs": 40, "queries": 32}, rope={"input_px": 128},
-        ablation={"steps": 60}, sigmas=(1.0, 4.0, 16.0),
-        evaluate={"pairs": 30, "points": 625},
-    ),
+    "quick": _preset("quick", **QUICK),
     "paper": _preset("paper", **PAPER),
     "workspace": _preset("workspace", **PAPER, scene="workspace"),
+    "workspace_quick": _preset("workspace_quick", **QUICK, scene="workspace"),
 }  # fmt: skip
 
 

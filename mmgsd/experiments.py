@@ -167,13 +167,21 @@ def configure_study(
 ) -> dict[str, TrainConfig]:
     """{row's name: training} of a study's models of an object, those of ``rows`` where they are given.
 
-    σ are the preset's where no rows are given; 0 ``steps`` are the study's own.
+    σ are the preset's where no rows are given; 0 ``steps`` are the study's own. A row whose
+    training is that of the row it starts from, which is one of them, is left out: the preset has what it would add.
     """
     if rows is None:
         rows = vary_sigma(preset.sigmas_px) if study == "sigma" else list_rows(study)
     base = (preset.ablation if study in SMALL else preset.train)[object]
-    models = {row.name: _configure(base, row) for row in rows if object in row.objects}
-    return {name: dataclasses.replace(model, steps=steps or model.steps) for name, model in models.items()}
+    models = {row.name: _join_clutter(_configure(base, row), preset) for row in rows if object in row.objects}
+    kept = [row.name for row in rows
+            if row.name in models and (row.scene or models[row.name] != models.get(row.start))]  # fmt: skip
+    return {name: dataclasses.replace(models[name], steps=steps or models[name].steps) for name in kept}
+
+
+def _join_clutter(model: TrainConfig, preset: Preset) -> TrainConfig:
+    """What learns from cluttered images besides learns from those of the preset's size."""
+    return dataclasses.replace(model, also=preset.cluttered) if model.also else model
 
 
 def configure_scene(preset: Preset, object: str, row: Model) -> RenderConfig:

@@ -95,7 +95,9 @@ def test_every_row_comes_to_a_training_of_its_objects(preset: str) -> None:
     for study in {study for row in MODELS for study in row.studies}:
         for object in OBJECTS:
             models = configure_study(load_preset(preset), object, study)
-            assert list(models) == [row.name for row in list_rows(study) if object in row.objects]
+            left_out = ("mmgsd_deep", "spcl_deep") if preset == "quick" else ()  # whose networks are deep already
+            rows = [row.name for row in list_rows(study) if object in row.objects and row.name not in left_out]
+            assert list(models) == rows
             assert {model.object for model in models.values()} <= {object}
 
 

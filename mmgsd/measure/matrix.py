@@ -5,6 +5,7 @@
     python -m mmgsd.measure.matrix paper --scheduler tcp://host:8786  each worker one model at a time, on its own GPU
     python -m mmgsd.measure.matrix quick --seeds 3                    instead the four methods, each with three seeds
     python -m mmgsd.measure.matrix paper --study robustness           instead the models of one study
+    python -m mmgsd.measure.matrix quick --study robustness --steps 300         each of so many steps
 
 Notebooks find the models and their tables of answers where they would have put them.
 """
@@ -45,6 +46,7 @@ from mmgsd.measure.evaluation import (
 )
 from mmgsd.parameters import read_scheduler
 
+TABLES = ("budget", "robustness")  # studies with a file of their own, of the preset's models under their rows' names
 VALIDATIONS = 8  # RMSE on held-out simulations, in a model's log
 
 Task = TrainConfig | tuple[str, str]  # a model to train and ask, or an object and a baseline to ask
@@ -123,10 +125,18 @@ def write_tables(preset: Preset, root: Path) -> None:
     Where the answers are not here, given on another machine, the row that is there is kept if it is of the same model.
     """
     write_main_table(preset, root)
-    for study in ("budget", "robustness"):
-        models = {name: configure_study(preset, name, study) for name in OBJECTS}
-        _write_study(models, Paths(root, preset.name), study)
+    for study in TABLES:
+        write_study_table(preset, root, study)
     write_sigma_table(preset, root)
+
+
+def write_study_table(preset: Preset, root: Path, study: str, *, steps: int = 0) -> None:
+    """Write the table of a study of `TABLES`, by the rule of `write_tables`.
+
+    The models of other ``steps`` than the study's have a file of their own: robustness_300.json.
+    """
+    models = {name: configure_study(preset, name, study, steps=steps) for name in OBJECTS}
+    _write_study(models, Paths(root, preset.name), f"{study}_{steps}" if steps else study)
 
 
 def write_main_table(preset: Preset, root: Path) -> dict[str, dict[str, dict]]:
@@ -208,15 +218,19 @@ def main() -> None:
     parser.add_argument("--only", default="", help="those whose name holds this text, like cloth or cloth-spcl")
     parser.add_argument("--study", default="", choices=STUDIES, help="instead the models of one study")
     parser.add_argument("--seeds", type=int, default=0, help="instead the four methods, each with so many seeds")
-    parser.add_argument("--steps", type=int, default=0, help="of those (default: the main table's)")
+    parser.add_argument("--steps", type=int, default=0, help=f"of those, or of the study {' or '.join(TABLES)}")
     parser.add_argument("--scheduler", default="", help="address of a Dask scheduler; none: this process")
     args = parser.parse_args()
-    if args.seeds < 0 or args.steps < 0 or (args.steps and not args.seeds):
-        parser.error("--seeds and --steps must be positive, and --steps needs --seeds")
+    if args.seeds < 0 or args.steps < 0 or (args.steps and not (args.seeds or args.study in TABLES)):
+        studies = " or ".join(TABLES)
+        parser.error(f"--seeds and --steps must be positive, and --steps needs --seeds or --study {studies}")
     if args.study and args.seeds:
         parser.error("--study and --seeds are two different lists of models: give one of them")
     preset, studies = load_preset(args.preset), (args.study,) if args.study else RUN
     tasks = list_repeats(preset, args.seeds, steps=args.steps) if args.seeds else list_tasks(preset, studies)
+    if args.steps and not args.seeds:
+        keyed = [configure_study(preset, name, args.study, steps=args.steps) for name in OBJECTS]
+        tasks = [model for models in keyed for model in models.values()]
     tasks = [task for task in tasks if args.only in name_task(task)]
     if not tasks:
         parser.error(f"--only {args.only!r}: no model or baseline of the preset {preset.name} has a name with that")
@@ -226,6 +240,8 @@ def main() -> None:
         tqdm.write(f"{name}: {rmse:.1f} px")
         if args.seeds:
             write_seed_table(preset, find_root(), args.seeds, steps=args.steps)
+        elif args.steps:
+            write_study_table(preset, find_root(), args.study, steps=args.steps)
         else:
             write_tables(preset, find_root())
 

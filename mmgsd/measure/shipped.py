@@ -5,9 +5,10 @@
     python -m mmgsd.measure.shipped robustness --photographs FOLDER    the models of that study, once they are trained
 
 A row a name: of weights in data/weights; of a baseline, which is asked about each object with the true masks, and in
-photographs with those that the shipped weights see; or of each model of the study `STUDY` of the preset `paper`. How
-modes are read (`mmgsd.match.mixture.Reading`) is the weights' own, unless the name says another after an @. The
-test images of the presets `SETS` have to be rendered. Tables of answers are kept, so that a killed call goes on.
+photographs with those that the shipped weights see; or of each model of the study `STUDY` of the preset `paper`, or of
+another with so many steps each (--preset quick --steps 300), which is asked about that preset's images. How modes are
+read (`mmgsd.match.mixture.Reading`) is the weights' own, unless the name says another after an @. The test images of
+the presets `SETS`, or of that one, have to be rendered. Tables of answers are kept, so that a killed call goes on.
 """
 
 from __future__ import annotations
@@ -17,15 +18,16 @@ import dataclasses
 import hashlib
 import statistics
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from mmgsd.checks import read_count
 from mmgsd.command import run_command
-from mmgsd.config import OBJECTS, EvaluateConfig, Paths, find_root, load_preset
+from mmgsd.config import OBJECTS, PRESETS, EvaluateConfig, Paths, Preset, find_root, load_preset
 from mmgsd.dataset import load_dataset
 from mmgsd.experiments import configure_study
 from mmgsd.files import read_json, write_json
@@ -58,26 +60,28 @@ RESULTS = "shipped.json"
 
 
 def measure_weights(
-    name: str, root: Path, *, weights: Path | None = None, photographs: Path | None = None, progress: bool = True
-) -> dict[str, Any]:
+    name: str, root: Path, *, weights: Path | None = None, photographs: Path | None = None,
+    presets: Sequence[str] = SETS, progress: bool = True,
+) -> dict[str, Any]:  # fmt: skip
     """The row of ``weights``, or of shipped ones: a dictionary a set of `SETS`, ``photographs``, ``milliseconds``.
 
     Of a set: `mmgsd.measure.metrics.aggregate` over visible sources, `summarise_uncertainty` by the weights' own
     calibration, its ``reliability`` beside a Gaussian's, ``within_radius``, the share of modes with a true match within
     `Match.radius_px` (level 0.9), and ``heads`` (`measure_heads`). ``milliseconds``: of one question about two images.
+    ``presets`` are those whose images stand for `SETS`.
     """
     file = weights or find_weights(name)
     matcher = Matcher.load(file)
     row = {"object": matcher.object, "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
            "calibrated": matcher.calibration is not None, "power": matcher.reading.power,
            "sharpness": matcher.reading.sharpness}  # fmt: skip
-    for preset in SETS:
+    for kind, preset in zip(SETS, presets, strict=True):
         paths = Paths(root, preset)
         data, config = paths.dataset(matcher.object), load_preset(preset).evaluate
         table = evaluate_model(file, data, config, paths.queries(f"shipped-{name}"), progress=progress)
         heads = evaluate_heads(file, data, EvaluateConfig(pairs=HEAD_PAIRS), paths.queries(f"heads-{name}"),
                                progress=progress)  # fmt: skip
-        row[preset] = _summarise(table, matcher) | {"heads": {key: read_json(heads)[key] for key in HEADS}}
+        row[kind] = _summarise(table, matcher) | {"heads": {key: read_json(heads)[key] for key in HEADS}}
     if photographs:
         row["photographs"] = measure_photographs(file, photographs, progress=progress)
     return row | _time_question(matcher, root)
@@ -175,7 +179,26 @@ def measure_baseline(
     return row
 
 
-def _measure(name: str, root: Path, photographs: Path | None) -> dict[str, dict[str, Any]]:
+def measure_study(
+    root: Path, preset: Preset, *, steps: int = 0, photographs: Path | None = None
+) -> dict[str, dict[str, Any]]:
+    """The rows of the models of `STUDY`, {object-row: as `measure_weights`, with the preset and the ``steps`` of each}.
+
+    FileNotFoundError where one is not trained yet.
+    """
+    paths = Paths(root, preset.name)
+    models = {f"{o}-{key}": m for o in OBJECTS for key, m in configure_study(preset, o, STUDY, steps=steps).items()}
+    files = {key: paths.model(model) / WEIGHTS for key, model in models.items()}
+    missing = [str(file) for file in files.values() if not file.is_file()]
+    if missing:
+        asked = f"{preset.name} --study {STUDY}" + (f" --steps {steps}" if steps else "")
+        raise FileNotFoundError(f"{missing[0]} does not exist: run python -m mmgsd.measure.matrix {asked}")
+    how = {"photographs": photographs, "presets": (preset.name, preset.cluttered)}
+    return {key: measure_weights(key, root, weights=file, **how) | {"preset": preset.name, "steps": models[key].steps}
+            for key, file in files.items()}  # fmt: skip
+
+
+def _measure(name: str, root: Path, photographs: Path | None, preset: str, steps: int) -> dict[str, dict[str, Any]]:
     """The rows of a name that is asked for."""
     how = {"photographs": photographs}
     if name in BASELINES:
@@ -184,15 +207,7 @@ def _measure(name: str, root: Path, photographs: Path | None) -> dict[str, dict[
         return {name: measure_read(name, root, **how)}
     if name != STUDY:
         return {name: measure_weights(name, root, **how)}
-    preset, paths = load_preset(SETS[0]), Paths(root, SETS[0])
-    models = {f"{o}-{key}": m for o in OBJECTS for key, m in configure_study(preset, o, STUDY).items()}
-    files = {key: paths.model(model) / WEIGHTS for key, model in models.items()}
-    missing = [str(file) for file in files.values() if not file.is_file()]
-    if missing:
-        raise FileNotFoundError(
-            f"{missing[0]} does not exist: run python -m mmgsd.measure.matrix paper --study {STUDY}"
-        )
-    return {key: measure_weights(key, root, weights=file, **how) for key, file in files.items()}
+    return measure_study(root, load_preset(preset), steps=steps, **how)
 
 
 def main() -> None:
@@ -205,11 +220,13 @@ def main() -> None:
         help=f"weights in data/weights, alone or with @POWER,SHARPNESS, {', '.join(BASELINES)}, or {STUDY}",
     )
     parser.add_argument("--photographs", type=Path, metavar="FOLDER", help="marked photographs, with index.json")
+    parser.add_argument("--preset", default=SETS[0], choices=tuple(PRESETS), help=f"whose {STUDY} (default: {SETS[0]})")
+    parser.add_argument("--steps", type=int, default=0, help=f"of each model of {STUDY} (default: the study's own)")
     args = parser.parse_args()
-    root = find_root()
+    root, study = find_root(), (args.preset, read_count("--steps", args.steps))
     out = root / "data" / "results" / RESULTS
     for name in args.names:
-        rows = _measure(name, root, args.photographs)
+        rows = _measure(name, root, args.photographs, *study)
         kept = read_results(out)
         for key, row in rows.items():  # photographs are not at everybody's hand: a call without them keeps the row's
             before = kept.get(key, {})

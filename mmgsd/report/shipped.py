@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from mmgsd.config import OBJECTS
+from mmgsd.config import OBJECTS, load_preset
 from mmgsd.experiments import ROWS, get_label
 from mmgsd.match.baselines import BASELINES
 
@@ -66,6 +66,14 @@ def make_readings_table(rows: Rows) -> str:
             row = rows[name]
             labels[name] = f"`{weights}`, power {row['power']:g}, sharpness {row['sharpness']:g}"
     return _make_pictures_lines(rows, labels)
+
+
+def make_budget_sentence(rows: Rows) -> str:
+    """How much the models of `make_parts_table` learnt from."""
+    row = next(row for row in rows.values() if "steps" in row)
+    images = load_preset(row["preset"]).render["cloth"]
+    return (f"Preset `{row['preset']}`: {row['steps']} steps each, from {images.train_images:,} images of a kind; "
+            f"{images.test_images} test images of each.")  # fmt: skip
 
 
 def make_knowledge_table(rows: Rows) -> str:

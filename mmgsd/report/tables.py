@@ -15,6 +15,7 @@ from mmgsd.report import descriptions as described
 from mmgsd.report.findings import describe_claims, make_findings
 from mmgsd.report.results import load_results, read_table, told_where
 from mmgsd.report.shipped import (
+    make_budget_sentence,
     make_counts_sentence,
     make_knowledge_table,
     make_parts_table,
@@ -94,6 +95,7 @@ TABLES: dict[str, tuple[str | tuple[str, ...], Callable[[Any], described.Table |
     "pictures": ("shipped.json", make_pictures_table),
     "parts": ("shipped.json", make_parts_table),
     "readings": ("shipped.json", make_readings_table),
+    "budget_of_parts": ("shipped.json", make_budget_sentence),
     "knowledge": ("shipped.json", make_knowledge_table),
     "sources": ("shipped.json", make_sources_sentence),
     "counts": ("shipped.json", make_counts_sentence),

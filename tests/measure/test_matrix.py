@@ -75,7 +75,7 @@ def test_errors_of_several_seeds_are_written(
     assert json.loads(written.read_text()) == table
 
 
-@pytest.mark.parametrize("words", ["--seeds -1", "--steps 10", "--seeds 2 --steps -1"])
+@pytest.mark.parametrize("words", ["--seeds -1", "--steps 10", "--seeds 2 --steps -1", "--study main --steps 9"])
 def test_how_often_to_train_is_checked(
     words: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
@@ -194,6 +194,16 @@ def test_a_study_can_be_run_alone(words: str, names: list[str], monkeypatch: pyt
     matrix.main()
     assert chosen == list(configure_study(paper, "cloth", words.split()[1]).values())
     assert list(configure_study(paper, "cloth", words.split()[1])) == names
+
+
+def test_a_study_can_be_run_at_a_smaller_budget(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    chosen, written = [], []
+    monkeypatch.setattr(matrix, "run_tasks", lambda tasks, *_, **__: chosen.extend(tasks) or iter([("one", 1.0)]))
+    monkeypatch.setattr(matrix, "_write_study", lambda models, paths, study: written.append(study))
+    monkeypatch.setattr("sys.argv", ["matrix", "quick", "--study", "robustness", "--steps", "7"])
+    matrix.main()
+    assert [model.steps for model in chosen] == [7] * 8 and written == ["robustness_7"]
+    assert [model.also for model in chosen[:4]] == ["", *["workspace_quick"] * 3]
 
 
 @pytest.mark.parametrize("words", ["--study fixes", "--study robustness --seeds 2"])

@@ -13,8 +13,9 @@ import pytest
 from test_heads_measured import write_weights
 
 from mmgsd.config import EvaluateConfig, Paths, load_preset
+from mmgsd.experiments import configure_study
 from mmgsd.measure import shipped
-from mmgsd.measure.shipped import Masked, main, measure_baseline, measure_read, measure_weights
+from mmgsd.measure.shipped import Masked, main, measure_baseline, measure_read, measure_study, measure_weights
 
 SAMPLE = Path(__file__).parents[2] / "data" / "sample"
 
@@ -83,6 +84,23 @@ def test_a_study_that_is_not_trained_says_how_to_train_it(root: Path, monkeypatc
     monkeypatch.setattr(sys, "argv", [sys.executable, "robustness"])
     with pytest.raises(FileNotFoundError, match="run python -m mmgsd.measure.matrix paper --study robustness"):
         main()
+    monkeypatch.setattr(shipped, "load_preset", load_preset)
+    monkeypatch.setattr(sys, "argv", [sys.executable, "robustness", "--preset", "quick", "--steps", "7"])
+    with pytest.raises(FileNotFoundError, match="matrix quick --study robustness --steps 7"):
+        main()
+
+
+def test_a_study_of_another_preset_is_asked_about_its_own_images(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    quick, asked = load_preset("quick"), []
+    for model in configure_study(quick, "cloth", "robustness", steps=7).values():
+        folder = Paths(root, "quick").model(model)
+        folder.mkdir(parents=True)
+        shutil.copy(root / "w.safetensors", folder / "weights.safetensors")
+    monkeypatch.setattr(shipped, "measure_weights", lambda name, root, **how: asked.append(how["presets"]) or {})
+    rows = measure_study(root, quick, steps=7)
+    assert list(rows) == [f"cloth-{name}" for name in ("mmgsd", "mmgsd_workspace", "mmgsd_clutter", "mmgsd_heads")]
+    assert set(asked) == {("quick", "workspace_quick")}
+    assert rows["cloth-mmgsd"] == {"preset": "quick", "steps": 7}
 
 
 def test_a_name_may_say_how_modes_are_read(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from mmgsd.report.shipped import (
     list_names,
+    make_budget_sentence,
     make_counts_sentence,
     make_knowledge_table,
     make_parts_table,
@@ -58,6 +59,12 @@ def test_ways_of_reading_stand_beside_the_weights_own() -> None:
         "| cloth, `cloth`, power 1.5, sharpness 4 | 21.0 | 21.0 | 51 % | 25 % | 8.0 % |",
         "| cloth, `cloth`, power 1, sharpness 1 | 25.6 | – | – | – | – |",
     ]
+
+
+def test_the_parts_budget_is_said() -> None:
+    rows = ROWS | {"cloth-mmgsd": {"preset": "quick", "steps": 300}}
+    said = "Preset `quick`: 300 steps each, from 300 images of a kind; 50 test images of each."
+    assert make_budget_sentence(rows) == said
 
 
 def test_knowledge_is_of_weights_alone() -> None:
