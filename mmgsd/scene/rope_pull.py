@@ -20,6 +20,7 @@ LEAST_STEPS = 40
 ROUNDS = 8  # of all constraints in a step
 SETTLE_ROUNDS = 250  # after the grippers let go
 FALL = 0.03  # diameters a round
+BEND_STRIDES = (2, 3)  # over which tight bends are opened, in particles
 LYING = 0.25  # how readily a particle on the table moves, of one in the air
 LOW = 0.75  # diameters: a particle below lies on the table
 
@@ -84,7 +85,7 @@ class _Chain:
                 _keep_lengths(points, weights, first)
             for stride in STRIDES:
                 bend(points, 0.0, stride)
-            for stride in (2, 3):
+            for stride in BEND_STRIDES:
                 limit_bends(points, stride)
             push_apart(points, pairs, apart)
             points[:, 2] = np.maximum(points[:, 2] - FALL, 0.5)
