@@ -25,6 +25,7 @@ EXTENT = 1.0  # m
 VISIBILITY_RADIUS = 0.004  # m; less than the distance that self-collision keeps between two layers
 STATES = {"flat": 0.10, "wrinkled": 0.24, "folded": 0.26, "folded twice": 0.10, "corner": 0.20, "crumpled": 0.10}
 SETTLE_FRAMES = 8
+FRICTION = 40.0  # of the floor, in Blender's units
 ATTEMPTS = 3  # at a move, before the cloth starts anew
 STARTS = 100  # of one cloth at most; a crumpled T-shirt or towel takes two on average
 MAX_STRETCH = 1.22  # of the 99th percentile of edges
@@ -269,16 +270,19 @@ _MOVES: dict[str, tuple[tuple[Plan, ...], ...]] = {
 # Physics. -----------------------------------------------------------------------------------------------------------
 
 
-def simulate(sheet: Sheet, vertices: np.ndarray, grasps: list[Grasp], frames: int) -> np.ndarray:
+def simulate(
+    sheet: Sheet, vertices: np.ndarray, grasps: list[Grasp], frames: int, *, friction: float = FRICTION
+) -> np.ndarray:
     """Run ``frames`` frames of cloth physics from ``vertices`` (V, 3) m at rest; the cloth remembers its flat shape.
 
-    Grasped vertices follow their paths, which must be ``frames`` long. Physics may return vertices that are not finite.
+    Grasped vertices follow their paths, which must be ``frames`` long; ``friction`` (0 to 80) is that of the floor.
+    Physics may return vertices that are not finite.
     """
     scene = bpy.context.scene
     scene.frame_start, scene.frame_end = 1, frames
     scene.frame_set(1)
     cloth = add_mesh("cloth physics", sheet.rest, sheet.faces)
-    floor = _add_floor()
+    floor = _add_floor(friction)
     _set_start(cloth, vertices)
     hooks = [_add_hook(cloth, grasp) for grasp in grasps]
     _add_physics(cloth, [grasp.vertex for grasp in grasps], frames)
@@ -326,11 +330,11 @@ def _add_physics(cloth: bpy.types.Object, pinned: list[int], frames: int) -> Non
     collision.collision_quality = 2  # with 1, layers pass through each other at ten times as many places
 
 
-def _add_floor() -> bpy.types.Object:
+def _add_floor(friction: float) -> bpy.types.Object:
     corners = np.array([[-3, -3, 0], [3, -3, 0], [3, 3, 0], [-3, 3, 0]], dtype=float)
     floor = add_mesh("physics floor", corners, np.array([[0, 1, 2, 3]]))
     floor.modifiers.new("collision", "COLLISION")
-    floor.collision.cloth_friction = 40.0
+    floor.collision.cloth_friction = friction
     floor.collision.thickness_outer = 0.005
     return floor
 

@@ -26,6 +26,7 @@ from mmgsd.scene import cloth, randomize, render, rope
 from mmgsd.scene.episode import add_floor
 from mmgsd.scene.grounds import Site, draw_ground
 from mmgsd.scene.materials import paint_object
+from mmgsd.scene.meshes import SPACING
 from mmgsd.scene.render import Camera, DeformedObject
 from mmgsd.scene.rope_pull import pull_rope
 from mmgsd.scene.rope_shape import LENGTH, OwnPart, RopeShape, sample_rope
@@ -38,12 +39,14 @@ MAX_OFFSET = 0.1  # m from the origin, along x and y, of a first state
 MAX_TILT_DEG = 30.0
 FLIP = (0.3, 0.45)  # m along x and y that the start "corner" flips its corner over; a demonstration the mean
 SLENDERNESS = (32, 50)  # of a rope: its length in diameters
-FINGER = 0.06  # m: so far a gripper reaches under the object from its rim
+FINGER = 0.1  # m: so far a gripper reaches under the object from its rim
 GRIP = 0.02  # m around a pick, in which layers are taken; below the distance of two vertices
-LEAST_FRAMES, FRAMES_A_METRE = 12, 14  # of a move
+LEAST_FRAMES, FRAMES_A_METRE = 12, 30  # of a move: a faster one swings the cloth beyond its aim
 SETTLE_FRAMES = 12
-LIFT = 0.42  # height of a cloth's arc over its length: nearly the half circle that neither drags nor pulls
+LIFT = 0.35  # height of a cloth's arc over its length: with a half circle's 0.5 the cloth is pulled along
+FRICTION = 80.0  # of the table: what lies on it must not be dragged along by what is lifted
 LAID_AT = 0.03  # m above the table, where grippers let go of a cloth
+MAX_STRETCH = 1.35  # of a rope, and of the 99th percentile of a cloth's edges: four layers in grippers reach 1.2
 LEAST_SEEN = 0.8  # share of the material points in the picture
 
 Moves = Sequence[tuple[Sequence[float], Sequence[float]]]  # pick (x, y) and place (x, y), px
@@ -141,16 +144,18 @@ def find_cloth_fault(vertices: np.ndarray) -> str:
     """What physics did to a cloth (V, 3) m that no cloth would bear; empty where nothing."""
     if not np.isfinite(vertices).all():
         return "nowhere"
-    stretched = cloth.measure_stretch(cloth.square_sheet(), vertices) > cloth.MAX_STRETCH
-    return f"stretched to more than {cloth.MAX_STRETCH:g} of its length" if stretched else ""
+    return _find_stretch(cloth.measure_stretch(cloth.square_sheet(), vertices))
 
 
 def find_rope_fault(centre: np.ndarray) -> str:
     """What was done to a rope (625, 3) m that no rope would bear; empty where nothing."""
     if not np.isfinite(centre).all():
         return "nowhere"
-    length = np.linalg.norm(np.diff(centre, axis=0), axis=1).sum()
-    return "" if length < cloth.MAX_STRETCH * LENGTH else f"stretched to more than {cloth.MAX_STRETCH:g} of its length"
+    return _find_stretch(np.linalg.norm(np.diff(centre, axis=0), axis=1).sum() / LENGTH)
+
+
+def _find_stretch(share: float) -> str:
+    return f"stretched to more than {MAX_STRETCH:g} of its length" if share > MAX_STRETCH else ""
 
 
 def move_cloth(vertices: np.ndarray, grasps: Sequence[tuple[Sequence[int], np.ndarray]]) -> np.ndarray:
@@ -167,8 +172,10 @@ def move_cloth(vertices: np.ndarray, grasps: Sequence[tuple[Sequence[int], np.nd
         lift, low = max(0.05, LIFT * np.linalg.norm(shift)), vertices[group, 2].min()
         path = cloth.arc_path(np.append(shift, LAID_AT - low), lift, frames)
         held |= {vertex: cloth.Grasp(vertex, path) for vertex in group if vertex not in held}
-    carried = cloth.simulate(sheet, vertices, list(held.values()), frames)
-    return cloth.simulate(sheet, carried, [], SETTLE_FRAMES) if np.isfinite(carried).all() else carried
+    carried = cloth.simulate(sheet, vertices, list(held.values()), frames, friction=FRICTION)
+    if not np.isfinite(carried).all():
+        return carried
+    return cloth.simulate(sheet, carried, [], SETTLE_FRAMES, friction=FRICTION)
 
 
 def _grasp_cloth(vertices: np.ndarray, camera: Camera, moves: Moves) -> list[tuple[list[int], np.ndarray]]:
@@ -193,7 +200,7 @@ def take_layers(vertices: np.ndarray, vertex: int) -> list[int]:
     angles = np.linspace(0, 2 * np.pi, 16, endpoint=False)
     around = place + FINGER * np.stack([np.cos(angles), np.sin(angles)], axis=1)  # (16, 2)
     gaps = np.linalg.norm(vertices[None, :, :2] - around[:, None], axis=-1).min(axis=1)
-    if gaps.max() < FINGER / 2:  # cloth all around
+    if gaps.max() < 0.9 * SPACING:  # cloth all around
         return [vertex]
     return [vertex, *(int(i) for i in np.flatnonzero(np.linalg.norm(vertices[:, :2] - place, axis=1) < GRIP)
                       if i != vertex)]  # fmt: skip
