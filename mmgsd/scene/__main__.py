@@ -1,6 +1,7 @@
 """Child process that renders one job: ``python -m mmgsd.scene < job.json``.
 
-The job holds ``config`` (the fields of ``RenderConfig``), ``split``, ``episodes`` as [[episode, views], …], ``sheet``
+A job with ``states`` makes each of them (`mmgsd.scene.folding`) and writes it to its ``out``. Any other renders: it
+holds ``config`` (the fields of ``RenderConfig``), ``split``, ``episodes`` as [[episode, views], …], ``sheet``
 (None, or the object as `Sheet.to_dict` gives it), ``out``, the archive to write, and where it is known ``mark``, which
 the archive keeps, and ``parent``, the process with which this one ends. Blender lives here alone: its memory goes with
 the process, and its chatter stays out of the parent's output. The exit code is 1 after an exception, its traceback on
@@ -31,12 +32,20 @@ PR_SET_PDEATHSIG = 1  # of Linux: which signal a process gets when its parent en
 
 
 def main() -> None:
-    """Read a job from stdin and render it."""
+    """Read a job from stdin and do it."""
     job = json.load(sys.stdin)
     if "parent" in job:
         end_with(job["parent"])
     with silenced():
-        render_job(job)
+        make_states(job) if "states" in job else render_job(job)
+
+
+def make_states(job: dict[str, Any]) -> list[Path]:
+    """Begin or go on with rollouts, one job of ``states`` after the other; their files."""
+    with one_core():
+        from mmgsd.scene.manipulation import run_job
+
+    return [run_job(one, Path(one["out"])) for one in job["states"]]
 
 
 def render_job(job: dict[str, Any]) -> Path:

@@ -25,6 +25,7 @@ EXTENT = 1.0  # m
 VISIBILITY_RADIUS = 0.004  # m; less than the distance that self-collision keeps between two layers
 STATES = {"flat": 0.10, "wrinkled": 0.24, "folded": 0.26, "folded twice": 0.10, "corner": 0.20, "crumpled": 0.10}
 SETTLE_FRAMES = 8
+FRICTION = 40.0  # of the floor, in Blender's units
 ATTEMPTS = 3  # at a move, before the cloth starts anew
 STARTS = 100  # of one cloth at most; a crumpled T-shirt or towel takes two on average
 MAX_STRETCH = 1.22  # of the 99th percentile of edges
@@ -101,7 +102,7 @@ def _perform(
         vertices = start.copy()
         for plan in move:
             grasps, count = plan(rng, vertices)
-            vertices = _simulate(sheet, vertices, grasps, count)
+            vertices = simulate(sheet, vertices, grasps, count)
             frames += count
         if not (fault := _find_fault(sheet, vertices)):
             return vertices, frames
@@ -113,16 +114,21 @@ def _find_fault(sheet: Sheet, vertices: np.ndarray) -> str:
     """How a cloth lies that is no good; empty where it lies hardly stretched and hardly cutting through itself."""
     if not np.isfinite(vertices).all():
         return "nowhere"
-    sides = np.sort(np.stack([sheet.faces, np.roll(sheet.faces, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
-    a, b = np.unique(sides, axis=0).T
-    now, at_rest = (np.linalg.norm(points[a] - points[b], axis=-1) for points in (vertices, sheet.rest))
-    if np.quantile(now / at_rest, 0.99) > MAX_STRETCH:
+    if measure_stretch(sheet, vertices) > MAX_STRETCH:
         return f"stretched to more than {MAX_STRETCH:g} of its length"
     if np.ptp(vertices[:, 2]) >= MAX_HEIGHT:
         return f"{MAX_HEIGHT:g} m high or higher"
     if count_crossings(vertices, sheet.faces) > MAX_CROSSINGS:
         return f"cutting through itself at more than {MAX_CROSSINGS} places"
     return ""
+
+
+def measure_stretch(sheet: Sheet, vertices: np.ndarray) -> float:
+    """How much longer than at rest the edges of a cloth (V, 3) m are: the 99th percentile of their shares."""
+    sides = np.sort(np.stack([sheet.faces, np.roll(sheet.faces, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
+    a, b = np.unique(sides, axis=0).T
+    now, at_rest = (np.linalg.norm(points[a] - points[b], axis=-1) for points in (vertices, sheet.rest))
+    return float(np.quantile(now / at_rest, 0.99))
 
 
 def count_crossings(vertices: np.ndarray, faces: np.ndarray) -> int:
@@ -203,7 +209,8 @@ def _gather(rng: np.random.Generator, vertices: np.ndarray) -> tuple[list[Grasp]
     grasps = []
     for i in picked:
         offset = (centre - vertices[i, :2]) * rng.uniform(0.4, 0.75)
-        grasps.append(Grasp(int(i), _arc(np.append(offset, rng.uniform(0.0, 0.06)), rng.uniform(0.05, 0.3), frames)))
+        shift = np.append(offset, rng.uniform(0.0, 0.06))
+        grasps.append(Grasp(int(i), arc_path(shift, rng.uniform(0.05, 0.3), frames)))
     return grasps, frames
 
 
@@ -232,14 +239,14 @@ def _fold_over(rng: np.random.Generator, vertices: np.ndarray, angle: float, sha
     grasps = []
     for i in sorted(held):
         shift = -2 * reach * (along[i] - line) * (normal + skew * np.array([-normal[1], normal[0]]))
-        grasps.append(Grasp(i, _arc(np.append(shift, 0.03), 0.75 * (along[i] - line), frames)))
+        grasps.append(Grasp(i, arc_path(np.append(shift, 0.03), 0.75 * (along[i] - line), frames)))
     anchors = np.flatnonzero(along < line - 4 * SPACING)
     for i in rng.choice(anchors, size=min(4, len(anchors)), replace=False):
         grasps.append(Grasp(int(i), np.zeros((frames, 3))))
     return grasps, frames
 
 
-def _arc(shift: np.ndarray, height: float, frames: int) -> np.ndarray:
+def arc_path(shift: np.ndarray, height: float, frames: int) -> np.ndarray:
     """Displacements (F, 3) along a half ellipse to ``shift`` (3,), ``height`` m high, slow at both ends, then held."""
     hold = 3
     s = np.linspace(0, 1, frames - hold)
@@ -263,13 +270,19 @@ _MOVES: dict[str, tuple[tuple[Plan, ...], ...]] = {
 # Physics. -----------------------------------------------------------------------------------------------------------
 
 
-def _simulate(sheet: Sheet, vertices: np.ndarray, grasps: list[Grasp], frames: int) -> np.ndarray:
-    """Run ``frames`` frames of cloth physics from ``vertices`` at rest; the cloth remembers its flat shape."""
+def simulate(
+    sheet: Sheet, vertices: np.ndarray, grasps: list[Grasp], frames: int, *, friction: float = FRICTION
+) -> np.ndarray:
+    """Run ``frames`` frames of cloth physics from ``vertices`` (V, 3) m at rest; the cloth remembers its flat shape.
+
+    Grasped vertices follow their paths, which must be ``frames`` long; ``friction`` (0 to 80) is that of the floor.
+    Physics may return vertices that are not finite.
+    """
     scene = bpy.context.scene
     scene.frame_start, scene.frame_end = 1, frames
     scene.frame_set(1)
     cloth = add_mesh("cloth physics", sheet.rest, sheet.faces)
-    floor = _add_floor()
+    floor = _add_floor(friction)
     _set_start(cloth, vertices)
     hooks = [_add_hook(cloth, grasp) for grasp in grasps]
     _add_physics(cloth, [grasp.vertex for grasp in grasps], frames)
@@ -317,11 +330,11 @@ def _add_physics(cloth: bpy.types.Object, pinned: list[int], frames: int) -> Non
     collision.collision_quality = 2  # with 1, layers pass through each other at ten times as many places
 
 
-def _add_floor() -> bpy.types.Object:
+def _add_floor(friction: float) -> bpy.types.Object:
     corners = np.array([[-3, -3, 0], [3, -3, 0], [3, 3, 0], [-3, 3, 0]], dtype=float)
     floor = add_mesh("physics floor", corners, np.array([[0, 1, 2, 3]]))
     floor.modifiers.new("collision", "COLLISION")
-    floor.collision.cloth_friction = 40.0
+    floor.collision.cloth_friction = friction
     floor.collision.thickness_outer = 0.005
     return floor
 

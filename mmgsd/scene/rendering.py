@@ -165,13 +165,13 @@ def render_batch(job: dict) -> bytes:
     """Render one job in a child process and return its zip file; RenderError where the child fails."""
     with scratch_folder(Path(tempfile.gettempdir()), "mmgsd-batch") as folder:
         out = folder / "batch.zip"
-        code, said = _run_child({**job, "out": str(out), "parent": os.getpid()}, folder)
+        code, said = run_child({**job, "out": str(out), "parent": os.getpid()}, folder)
         if code or not out.is_file():
-            raise RenderError(f"rendering {job['split']} {job['episodes']} {_explain(code)}:\n{said[-2000:]}")
+            raise RenderError(f"rendering {job['split']} {job['episodes']} {explain(code)}:\n{said[-2000:]}")
         return out.read_bytes()
 
 
-def _run_child(job: dict, folder: Path) -> tuple[int, str]:
+def run_child(job: dict, folder: Path) -> tuple[int, str]:
     """Exit code and stderr of a child that renders ``job``, with ``folder`` for all its temporary files."""
     path = os.pathsep.join([str(Path(__file__).resolve().parents[2]), os.environ.get("PYTHONPATH", "")])
     # as many children as cores, so one thread in each
@@ -191,7 +191,7 @@ def _run_child(job: dict, folder: Path) -> tuple[int, str]:
     return child.returncode, said
 
 
-def _explain(code: int) -> str:
+def explain(code: int) -> str:
     """How a child ended, from its exit code."""
     if code >= 0:
         return "failed"
@@ -201,7 +201,11 @@ def _explain(code: int) -> str:
 
 
 @contextlib.contextmanager
-def _connect(workers: int, scheduler: str) -> Iterator[Client]:
+def connect(workers: int, scheduler: str) -> Iterator[Client]:
+    """A client of the Dask cluster at the address ``scheduler``, or of one in this process, with ``workers`` threads.
+
+    0 workers: as many as this process may use cores. At the end the children of this process are ended.
+    """
     if scheduler:
         with Client(scheduler) as client:
             yield client
@@ -238,7 +242,7 @@ def _render_missing(
     missing = {name: job for name, job in jobs.items() if not _is_whole(partial / f"{name}.zip", job, claimed)}
     write_json(partial / "config.json", _describe(config))
     if missing:
-        with _connect(workers, scheduler) as client:
+        with connect(workers, scheduler) as client:
             _render_batches(client, missing, partial, config, progress)
 
 

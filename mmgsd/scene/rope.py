@@ -65,7 +65,7 @@ def build_rope(rng: np.random.Generator, config: RenderConfig) -> DeformedObject
         "length": LENGTH,
     }
     parts = build_parts(shape, lay)
-    return DeformedObject(_add_parts(parts), points, shape.thickness, info, OwnPart(points, OWN_ARC * shape.thickness))
+    return DeformedObject(add_parts(parts), points, shape.thickness, info, OwnPart(points, OWN_ARC * shape.thickness))
 
 
 def draw_lay(rng: np.random.Generator) -> Lay:
@@ -221,7 +221,7 @@ def _sphere(centre: np.ndarray, radius: float) -> np.ndarray:
 # --- mesh -------------------------------------------------------------------------------------------------------------
 
 
-def _add_parts(parts: list[Part]) -> bpy.types.Object:
+def add_parts(parts: list[Part]) -> bpy.types.Object:
     """One smooth object of all parts, a material slot for each kind of face that occurs."""
     faces, kinds, places, start = [], [], [], 0
     for part in parts:

@@ -30,15 +30,15 @@ def relax(points: np.ndarray, tension: np.ndarray, ball_radius: float) -> np.nda
     floor[0] = max(0.5, ball_radius)
     for step in range(ROUNDS):
         if step % 4 == 0:
-            pairs, reach = _near_pairs(points, ball_radius)
+            pairs, reach = near_pairs(points, ball_radius)
         pull = tension * min(1.0, 2 * step / ROUNDS, 4 - 4 * step / ROUNDS)  # rises, and is let go at the end
         for stride, rest in rests.items():
-            _bend(points, rest * (1 - pull[stride:-stride]), stride)
+            bend(points, rest * (1 - pull[stride:-stride]), stride)
         points[1:-1] -= 0.15 * pull[1:-1, None] * _residual(points, 0.0, 1)
         points[:, 2] -= GRAVITY
         for stride in (2, 3):
-            _limit_bends(points, stride)
-        _push_apart(points, pairs, reach)
+            limit_bends(points, stride)
+        push_apart(points, pairs, reach)
         np.maximum(points[:, 2], floor, out=points[:, 2])
     return points
 
@@ -56,7 +56,7 @@ def _residual(points: np.ndarray, rest: np.ndarray | float, stride: int) -> np.n
     return residual
 
 
-def _bend(points: np.ndarray, rest: np.ndarray, stride: int) -> None:
+def bend(points: np.ndarray, rest: np.ndarray | float, stride: int) -> None:
     """One descent step on an elastic beam's energy, the sum of squared residuals: bends go back to their rest."""
     residual = 0.35 * _residual(points, rest, stride)
     points[stride:-stride] -= residual
@@ -64,7 +64,7 @@ def _bend(points: np.ndarray, rest: np.ndarray, stride: int) -> None:
     points[: -2 * stride] += residual / 2
 
 
-def _limit_bends(points: np.ndarray, stride: int) -> None:
+def limit_bends(points: np.ndarray, stride: int) -> None:
     """Open bends that are tighter than MIN_RADIUS, seen over a stride of particles."""
     chord = (points[2 * stride :] + points[: -2 * stride]) / 2 - points[stride:-stride]
     depth = np.linalg.norm(chord, axis=1, keepdims=True)
@@ -76,7 +76,7 @@ def _limit_bends(points: np.ndarray, stride: int) -> None:
     points[: -2 * stride] -= move / 2
 
 
-def _near_pairs(points: np.ndarray, ball_radius: float) -> tuple[np.ndarray, np.ndarray]:
+def near_pairs(points: np.ndarray, ball_radius: float) -> tuple[np.ndarray, np.ndarray]:
     """Pairs of particles (P, 2) that might touch, and the distance (P,) each must keep."""
     arc = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     pairs = cKDTree(points).query_pairs(1.3, output_type="ndarray")
@@ -89,7 +89,7 @@ def _near_pairs(points: np.ndarray, ball_radius: float) -> tuple[np.ndarray, np.
     return pairs, reach
 
 
-def _push_apart(points: np.ndarray, pairs: np.ndarray, reach: np.ndarray) -> None:
+def push_apart(points: np.ndarray, pairs: np.ndarray, reach: np.ndarray) -> None:
     """Move touching pairs (P, 2) apart along the line between them, each particle by the mean of its pushes."""
     gap = points[pairs[:, 0]] - points[pairs[:, 1]]
     distance = np.linalg.norm(gap, axis=1)

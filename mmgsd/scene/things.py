@@ -148,14 +148,15 @@ UPON: dict[str, Maker] = {name: BESIDE[name] for name in ("pen", "weight", "disc
 
 
 def add_things(rng: np.random.Generator, site: Site, camera: Camera, visible: np.ndarray, *, beside: bool,
-               walls: list[Solid]) -> tuple[np.ndarray, list[str]]:  # fmt: skip
+               walls: list[Solid], over: bool = True) -> tuple[np.ndarray, list[str]]:  # fmt: skip
     """Put things around and on the object: which points (P,) of those ``visible`` they leave so, and their names.
 
-    ``walls`` are solids that are there already. What would hide too much, or stand before the lens, is left out.
+    ``walls`` are solids that are there already; without ``over`` nothing lies on the object or reaches for it. What
+    would hide too much, or stand before the lens, is left out.
     """
     scale, names = np.exp(rng.uniform(np.log(0.5), np.log(1.6))) * site.side, []
     left = visible & ~find_covered(walls, site.points, camera)
-    for name, maker, place in _choose(rng, site, beside):
+    for name, maker, place in _choose(rng, site, beside, over):
         for _ in range(TRIES):
             parts = place(rng, site, _scale(maker(rng), scale))
             if parts is None or not _is_clear(parts, camera):
@@ -182,7 +183,7 @@ def find_covered(solids: list[Solid], points: np.ndarray, camera: Camera) -> np.
     return covered
 
 
-def _choose(rng: np.random.Generator, site: Site, beside: bool) -> Iterator[tuple[str, Maker, Place]]:
+def _choose(rng: np.random.Generator, site: Site, beside: bool, over: bool) -> Iterator[tuple[str, Maker, Place]]:
     """Names, makers and placers of what is put around and on the object; no cord beside a rope, they are too alike."""
     cords = {"cord"} if site.slender else set()
     around = {name: maker for name, maker in BESIDE.items() if name not in cords}
@@ -190,7 +191,7 @@ def _choose(rng: np.random.Generator, site: Site, beside: bool) -> Iterator[tupl
     for _ in range(min(6, rng.poisson(1.6)) if beside else 0):
         name = str(rng.choice(list(around)))
         yield name, around[name], _place_beside
-    for _ in range(int(rng.choice(len(OVER_COUNTS), p=OVER_COUNTS))):
+    for _ in range(int(rng.choice(len(OVER_COUNTS), p=OVER_COUNTS)) if over else 0):
         kinds, place = (OVER, _place_over) if rng.random() < 0.65 else (upon, _place_upon)
         name = str(rng.choice(list(kinds)))
         yield name, kinds[name], place

@@ -70,10 +70,10 @@ def _describe_site(
     slender = deformed.is_own_hit is not None
     thickness = deformed.visibility_radius / 2 if slender else 0.0
     side = EXTENT if config.object == "cloth" else span
-    return Site(deformed.points, side, turn, _find_seen(rng, camera), colour, thickness, slender)
+    return Site(deformed.points, side, turn, find_seen(rng, camera), colour, thickness, slender)
 
 
-def _find_seen(rng: np.random.Generator, camera: Camera) -> np.ndarray:
+def find_seen(rng: np.random.Generator, camera: Camera) -> np.ndarray:
     """Places (K, 2) m on z = 0 that the picture shows, evenly spread over the picture and a little beyond."""
     xy = (rng.uniform(-0.08, 1.08, size=(60, 2))) * camera.size
     rays = np.column_stack([xy, np.ones(len(xy))]) @ np.linalg.inv(camera.intrinsics).T @ camera.pose[:3, :3].T
@@ -99,20 +99,23 @@ def draw_camera(
         tilt = min(tilt, MAX_TILT_DEG)
         fill = rng.uniform(0.2, 1.05) if rng.random() < 0.4 else rng.uniform(0.45, 0.95)
         nearness = np.exp(rng.uniform(np.log(0.8), np.log(3.5)))
-        camera = _frame(rng, points, size, turn, tilt, fill, nearness)
+        camera = frame_points(rng, points, size, turn, tilt, fill, nearness)
         depth = (points - camera.pose[:3, 3]) @ camera.pose[:3, 2]
         wide = thin * camera.intrinsics[0, 0] / depth.max()
         outside = 1 - camera.contains(camera.project(points)).mean()
         if depth.min() > 0.25 and wide >= LEAST_PX and outside <= MAX_OUTSIDE:
             return camera, turn, float(tilt)
-    return _frame(rng, points, size, turn, 0.0, 0.8, 3.0), turn, 0.0
+    return frame_points(rng, points, size, turn, 0.0, 0.8, 3.0), turn, 0.0
 
 
-def _frame(
+def frame_points(
     rng: np.random.Generator, points: np.ndarray, size: tuple[int, int], turn: float, tilt: float, fill: float,
-    nearness: float,
+    nearness: float, *, shift: float = 0.9,
 ) -> Camera:  # fmt: skip
-    """Points (N, 3) m seen from ``nearness`` times their extent, tilted (degrees), filling a share of the picture."""
+    """Points (N, 3) m seen from ``nearness`` times their extent, tilted (degrees), filling a share of the picture.
+
+    They are moved aside by at most ``shift`` of the room that they leave.
+    """
     down = np.array(Euler((np.pi + np.radians(tilt), 0.0, 0.0)).to_matrix())
     rotation = np.array(Euler((0.0, 0.0, turn)).to_matrix()) @ down
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
@@ -122,9 +125,9 @@ def _frame(
     low, high = plane.min(axis=0), plane.max(axis=0)
     focal = fill * np.min(np.array(size) / (high - low))  # px
     slack = np.maximum(np.array(size) / focal - (high - low), 0) / 2
-    shift = ((low + high) / 2 - rng.uniform(-0.9, 0.9, size=2) * slack) * distance
+    aside = ((low + high) / 2 - rng.uniform(-shift, shift, size=2) * slack) * distance
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, middle + rotation @ np.array([*shift, -distance])
+    pose[:3, :3], pose[:3, 3] = rotation, middle + rotation @ np.array([*aside, -distance])
     intrinsics = np.array([[focal, 0, (size[0] - 1) / 2], [0, focal, (size[1] - 1) / 2], [0, 0, 1]])
     return Camera(intrinsics, pose, size)
 

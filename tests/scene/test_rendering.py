@@ -190,7 +190,7 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         asked.append(job["split"])
         return run_child(job, folder)
 
-    monkeypatch.setattr(rendering, "_run_child", draw)
+    monkeypatch.setattr(rendering, "run_child", draw)
     return asked
 
 
@@ -287,7 +287,7 @@ def test_batches_are_known_again_by_their_marks_where_the_claim_is_damaged(
 
 
 def test_a_killed_child_is_said_to_be_killed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rendering, "_run_child", lambda job, folder: (-signal.SIGKILL, ""))
+    monkeypatch.setattr(rendering, "run_child", lambda job, folder: (-signal.SIGKILL, ""))
     with pytest.raises(RenderError, match="ended by SIGKILL: memory may be short, so try fewer workers"):
         render_batch(next(iter(plan_batches(CONFIG).values())))
 
@@ -314,7 +314,7 @@ def test_nothing_listens_beyond_this_machine_while_it_renders(tmp_path: Path, mo
         listening.update(c.laddr.ip for c in there if c.status == psutil.CONN_LISTEN)
         return run_child(job, folder)
 
-    monkeypatch.setattr(rendering, "_run_child", look)
+    monkeypatch.setattr(rendering, "run_child", look)
     render(tmp_path / "rope")
     assert listening <= {"127.0.0.1", "::1"}
 

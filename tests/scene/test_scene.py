@@ -122,7 +122,7 @@ def test_crossings_count_a_flap_pushed_through_the_cloth():
 
 def test_a_cloth_that_never_comes_to_lie_is_given_up_with_the_reasons(monkeypatch):
     results = iter([cloth.flat_vertices() * factor for factor in ((1, 1, np.nan), (2, 2, 1))] * 99)
-    monkeypatch.setattr(cloth, "_simulate", lambda *_: next(results))
+    monkeypatch.setattr(cloth, "simulate", lambda *_: next(results))
     monkeypatch.setattr(cloth, "STARTS", 2)
     with pytest.raises(SceneError, match="cloth did not .*'flat' in 2 starts with 3 .*nowhere 3 times, stretched.* 3"):
         cloth.deform(np.random.default_rng(0), "flat")

@@ -83,7 +83,7 @@ def test_the_object_is_in_the_picture_however_the_camera_tilts(limit: float) -> 
 
 
 def test_points_behind_a_thing_are_covered_and_the_others_are_not() -> None:
-    camera = workspace._frame(np.random.default_rng(0), FLAT.points, SIZE, 0.0, 0.0, 0.8, 3.0)
+    camera = workspace.frame_points(np.random.default_rng(0), FLAT.points, SIZE, 0.0, 0.0, 0.8, 3.0)
     box = solids.make_box((0.3, 0.3, 0.02), (0.2, 0.2, 0.1))
     covered = things.find_covered([box], FLAT.points, camera)
     apart = np.abs(FLAT.points[:, :2] - 0.2).max(axis=1)
@@ -93,7 +93,7 @@ def test_points_behind_a_thing_are_covered_and_the_others_are_not() -> None:
 
 def test_things_leave_at_least_half_of_the_object_to_be_seen(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(things, "OVER_COUNTS", (0.0, 0.0, 1.0))
-    camera = workspace._frame(np.random.default_rng(0), FLAT.points, SIZE, 0.0, 20.0, 0.8, 3.0)
+    camera = workspace.frame_points(np.random.default_rng(0), FLAT.points, SIZE, 0.0, 20.0, 0.8, 3.0)
     seen = np.ones(len(FLAT.points), dtype=bool)
     site = grounds.Site(FLAT.points, 1.0, 0.0, np.random.default_rng(1).uniform(-2, 2, (60, 2)), (9, 9, 9), 0.0, False)
     hidden = []
@@ -117,7 +117,7 @@ def test_things_cast_shadows() -> None:
     grounds._add_floor(materials.paint_plain(np.random.default_rng(0), (250, 250, 250)), 0.0)
     box = solids.make_box((0.2, 0.2, 0.3), (0, 0, 0.15))
     grounds.add_solid(box, materials.paint_plain(np.random.default_rng(0), (250, 250, 250)))
-    render.place_camera(scene, workspace._frame(np.random.default_rng(0), FLAT.points, SIZE, 0.0, 0.0, 1.0, 3.0))
+    render.place_camera(scene, workspace.frame_points(np.random.default_rng(0), FLAT.points, SIZE, 0.0, 0.0, 1.0, 3.0))
     workspace.randomize.set_world(scene, (1.0, 1.0, 1.0, 1.0), 0.1)
     lamp = workspace.randomize.new_lamp(scene, "SUN")
     lamp.data.energy, lamp.rotation_euler = 3.0, (0.0, np.radians(50), 0.0)  # from +x

@@ -1,0 +1,1 @@
+"""From matches to actions: folding by one demonstration."""
