@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import importlib.util
 import re
+import subprocess
 from pathlib import Path
 
 import nbformat
+import pandas as pd
 import pytest
 
 from mmgsd.report.findings import FINDINGS, SECTIONS
@@ -98,3 +100,18 @@ def test_the_results_page_says_how_to_read_each_table_in_few_words() -> None:
         assert "*The paper*" in section and "```sh" in section, section[:40]
         reading = section.partition("*How to read it*")[2].partition("\n\n")[0]
         assert 0 < len(reading.split()) <= 80, section[:40]
+
+
+def test_lessons_are_of_commits_and_of_rows_of_their_date() -> None:
+    log = (ROOT / "data" / "results" / "LOG.md").read_text("utf-8")
+    lessons = re.findall(r"^\| (\d{4}-\d\d-\d\d) \| ([0-9a-f]{7}) \| .+ \|$", log, re.MULTILINE)
+    assert len(lessons) == log.count("\n| 20") and lessons == sorted(lessons, key=lambda lesson: lesson[0])
+    rows = pd.read_csv(ROOT / "data" / "results" / "experiments.csv")
+    ran = set(zip(rows.date, rows.commit.str[:7], strict=True))
+    if subprocess.run(["git", "rev-parse", "--is-shallow-repository"], cwd=ROOT, capture_output=True, text=True,
+                      check=False).stdout.strip() != "false":  # fmt: skip
+        pytest.skip("no history here")
+    for date, commit in lessons:
+        told = subprocess.run(["git", "log", "-1", "--format=%ad", "--date=short", commit], cwd=ROOT,
+                              capture_output=True, text=True, check=True).stdout.strip()  # fmt: skip
+        assert (date, commit) in ran or told == date, f"{commit} of {date}"
