@@ -1,0 +1,122 @@
+"""Which of the like modes belong together: those that one motion of the plane takes the demonstration's pixels to.
+
+Each question alone has as many answers as the object's symmetry has members, and nothing says which pick goes with
+which place. Of an object that lies about as in the demonstration, a motion says it for all of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+RADIUS = 0.08  # of the questions' extent: as near as a mode is to where the motion takes its pixel, where both agree
+MAX_SCALE = 1.25  # of two questions' distance, by which it may grow or shrink where the scale is known
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """z ↦ ``factor`` z + ``shift`` of points x + iy: a turn and a shift, and a scale where the factor is no unit."""
+
+    factor: complex
+    shift: complex
+
+    def apply(self, points: np.ndarray) -> np.ndarray:
+        """Where points (…, 2) come to lie."""
+        return to_points(self.factor * to_complex(points) + self.shift)
+
+
+@dataclass(frozen=True, eq=False)
+class Agreement:
+    """The motion that most answers agree with, how many of the questions do, and each one's mode."""
+
+    motion: Motion
+    share: float  # of the questions whose mode is near
+    chosen: np.ndarray  # (S,) index of the mode nearest to where the motion takes a question; -1 where none is near
+
+
+def to_complex(points: np.ndarray) -> np.ndarray:
+    """Points (…, 2) as numbers (…)."""
+    points = np.asarray(points, float)
+    return points[..., 0] + 1j * points[..., 1]
+
+
+def to_points(numbers: np.ndarray) -> np.ndarray:
+    """Numbers (…) as points (…, 2)."""
+    return np.stack([np.real(numbers), np.imag(numbers)], -1)
+
+
+def find_agreement(
+    asked: np.ndarray, modes: np.ndarray, weights: np.ndarray, *, free_scale: bool = False
+) -> Agreement | None:
+    """The agreement of modes (S, n, 2) with weights (S, n) about ``asked`` (S, 2), one unit for all; None of none.
+
+    Every two questions and their modes propose a motion, with their distance's scale where ``free_scale``; the one
+    whose modes near by weigh most is fitted again to these. NaN modes do not count. ValueError for fewer than two
+    questions, or all at one place.
+    """
+    source, target = to_complex(asked), to_complex(modes)  # (S,), (S, n)
+    extent = np.abs(source - source.mean()).max() if len(source) else 0.0
+    if len(source) < 2 or not extent > 0:
+        raise ValueError(f"asked must be at least two places, got {np.asarray(asked).tolist()}")
+    weights = np.where(np.isfinite(target), weights, 0.0)
+    motions = _propose(source, target, free_scale)  # (M, 2)
+    if not len(motions):
+        return None
+    scores = [_weigh(motion, source, target, weights, 2 * RADIUS * extent).max(1).sum() for motion in motions]
+    motion = motions[int(np.argmax(scores))]
+    for _ in range(3):
+        near = _weigh(motion, source, target, weights, 2 * RADIUS * extent)
+        motion = _fit(source, target, near, motion, free_scale)
+    near = _weigh(motion, source, target, weights, 2 * RADIUS * extent)
+    chosen = np.where(near.max(1) > 0, near.argmax(1), -1)
+    return Agreement(Motion(*map(complex, motion)), float(np.mean(chosen >= 0)), chosen)
+
+
+def _propose(source: np.ndarray, target: np.ndarray, free_scale: bool) -> np.ndarray:
+    """Motions (M, 2), factor and shift each, of every two questions and their modes."""
+    found = []
+    for i, j in combinations(range(len(source)), 2):
+        if source[i] == source[j]:
+            continue
+        factor = (target[j][None] - target[i][:, None]) / (source[j] - source[i])  # (n, n)
+        scale = np.abs(factor)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            allowed = np.isfinite(factor) & (scale > 0)
+            if not free_scale:
+                allowed &= (scale < MAX_SCALE) & (scale > 1 / MAX_SCALE)
+                factor = factor / scale
+        middle = (target[i][:, None] + target[j][None]) / 2
+        shift = middle - factor * (source[i] + source[j]) / 2
+        found.append(np.stack([factor[allowed], shift[allowed]], 1))
+    return np.concatenate(found) if found else np.zeros((0, 2), complex)
+
+
+def _weigh(motion: np.ndarray, source: np.ndarray, target: np.ndarray, weights: np.ndarray, reach: float) -> np.ndarray:
+    """(S, n): the modes' weights, less the farther they are from where the motion takes the question, 0 from reach."""
+    distance = np.abs(target - (motion[0] * source + motion[1])[:, None])
+    return np.nan_to_num(weights * np.clip(1 - (distance / reach) ** 2, 0, None))
+
+
+def _fit(source: np.ndarray, target: np.ndarray, near: np.ndarray, motion: np.ndarray, free_scale: bool) -> np.ndarray:
+    """The motion that takes questions to their modes with the least squared error, each by its weight (S, n)."""
+    rows, best = np.arange(len(source)), near.argmax(1)
+    weight, aim = near[rows, best], target[rows, best]
+    if np.count_nonzero(weight) < 2:
+        return motion
+    source, aim, weight = source[weight > 0], aim[weight > 0], weight[weight > 0]
+    middle, goal = (np.average(values, weights=weight) for values in (source, aim))
+    product = np.sum(weight * (aim - goal) * np.conj(source - middle))
+    size = np.sum(weight * np.abs(source - middle) ** 2) if free_scale else np.abs(product)
+    if not size > 0:
+        return motion
+    return np.array([product / size, goal - product / size * middle])
+
+
+def fit_motion_to(source: np.ndarray, target: np.ndarray, *, free_scale: bool = False) -> Motion:
+    """The motion that takes points (N, 2) to others with the least squared error; ValueError of fewer than two."""
+    if len(source) < 2 or np.shape(source) != np.shape(target):
+        raise ValueError(f"source and target must be as many points, two or more, got {len(source)} and {len(target)}")
+    ones, start = np.ones((len(source), 1)), np.array([1.0, 0.0], complex)
+    return Motion(*map(complex, _fit(to_complex(source), to_complex(target)[:, None], ones, start, free_scale)))

@@ -1,0 +1,75 @@
+"""How near an object comes to the demonstration's end: error, overlap, success, and their intervals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from mmgsd.fold.tasks import fit_motion
+
+SIDES_M = {"cloth": 1.0, "rope": 1.6}  # of the cloth, or the rope's length
+SUCCESS = 0.05  # of the side: an error below it is a success
+CELL_M = 0.005  # of the pictures whose overlap is measured
+ROPE_M = 0.02  # how wide a rope is drawn in them
+DRAWS = 2000  # of a bootstrap
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a rollout ended; both are after the best motion in the plane, the error's least over the symmetry group."""
+
+    error_m: float  # mean distance of the material points to the demonstration's
+    overlap: float  # intersection over union of the silhouettes from above, in [0, 1]
+
+
+def measure_outcome(points: np.ndarray, wanted: np.ndarray, permutations: np.ndarray, object: str) -> Outcome:
+    """Of material points (P, 3) m beside the demonstration's end (P, 3) m under a group (G, P).
+
+    The rigid motion in the plane is that of least squares; heights count in the error. NaN points give an infinite
+    error and no overlap.
+    """
+    if not np.isfinite(points).all():
+        return Outcome(float("inf"), 0.0)
+    best, moved = np.inf, points
+    for order in permutations:
+        turn, shift = fit_motion(points[order], wanted)
+        candidate = np.column_stack([points[order][:, :2] @ turn.T + shift, points[order][:, 2]])
+        error = float(np.linalg.norm(candidate - wanted, axis=1).mean())
+        if error < best:
+            best, moved = error, candidate
+    return Outcome(best, measure_overlap(moved, wanted, object))
+
+
+def measure_overlap(points: np.ndarray, wanted: np.ndarray, object: str) -> float:
+    """Intersection over union, in [0, 1], of the silhouettes from above of two (P, 3) m."""
+    low = np.minimum(points.min(0), wanted.min(0))[:2] - 0.05
+    size = np.ceil((np.maximum(points.max(0), wanted.max(0))[:2] + 0.05 - low) / CELL_M).astype(int)
+    drawn = [_draw(points_[:, :2], low, size, object) for points_ in (points, wanted)]
+    return float((drawn[0] & drawn[1]).sum() / max(1, (drawn[0] | drawn[1]).sum()))
+
+
+def _draw(xy: np.ndarray, low: np.ndarray, size: np.ndarray, object: str) -> np.ndarray:
+    """(h, w) bool, a cell a `CELL_M`: the grid's quads of a cloth, a rope's line."""
+    picture, cells = np.zeros(size[::-1], np.uint8), np.round((xy - low) / CELL_M).astype(np.int32)
+    if object == "rope":
+        cv2.polylines(picture, [cells], False, 1, thickness=max(1, round(ROPE_M / CELL_M)))
+        return picture.astype(bool)
+    side = round(len(cells) ** 0.5)
+    grid = cells.reshape(side, side, 2)
+    quads = np.stack([grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]], 2).reshape(-1, 4, 2)
+    for quad in quads:
+        cv2.fillConvexPoly(picture, quad, 1)
+    return picture.astype(bool)
+
+
+def estimate_mean(values: np.ndarray, *, seed: int = 0) -> dict[str, float | int | None]:
+    """Mean of (N,) values, its 95 % interval by bootstrap ("low", "high"), and their count; None of no value."""
+    values = np.asarray(values, float)
+    if not len(values):
+        return {"mean": None, "low": None, "high": None, "count": 0}
+    drawn = np.random.default_rng(seed).choice(values, (DRAWS, len(values))).mean(1)
+    low, high = np.quantile(drawn, [0.025, 0.975])
+    numbers = {"mean": values.mean(), "low": low, "high": high}
+    return {name: round(float(value), 5) for name, value in numbers.items()} | {"count": len(values)}

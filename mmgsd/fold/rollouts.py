@@ -1,0 +1,238 @@
+"""The bench: rollouts of every policy from the same first states, as files, and what came of them.
+
+    python -m mmgsd.fold.rollouts quick              -> data/results/quick/folding.json
+    python -m mmgsd.fold.rollouts quick --only mmgsd       those policies whose name holds that text
+
+All go in step: first states, every policy's answers, what physics makes of them, the next look. A killed run goes on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from mmgsd.checks import check_choice
+from mmgsd.command import run_command
+from mmgsd.config import DEFAULT_GROUP, OBJECTS, Paths, find_root
+from mmgsd.files import DamagedFileError, read_json, set_aside, write_json
+from mmgsd.fold.agreement import Motion
+from mmgsd.fold.demonstration import Demonstration, Look
+from mmgsd.fold.measures import SIDES_M, SUCCESS, estimate_mean, measure_outcome
+from mmgsd.fold.policies import POLICIES, Answer, Policy, ask, choose_moves, digest_policy, draw_moves
+from mmgsd.fold.tasks import GROUNDS, TASKS, Task
+from mmgsd.learn.training import name_hardware
+from mmgsd.match.camera import compute_rays
+from mmgsd.progress import ProgressBar
+from mmgsd.scene.folding import act_job, demonstration_job, run_jobs, start_job, true_moves
+from mmgsd.scene.state import State, read_state
+from mmgsd.symmetry import load_group
+
+ROLLOUTS = {"smoke": 2, "quick": 10, "paper": 100}  # of each policy and object
+AGREES = 0.7  # share of the questions that agree from which a cautious robot acts
+ANCHORS = {"cloth": [25 * r + c for r in (1, 12, 23) for c in (1, 12, 23) if (r, c) != (12, 12)],
+           "rope": [8, 120, 200, 424, 504, 616]}  # fmt: skip  # material points that a demonstration marks besides
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """One first state: which task, from which start, on which ground, with which seed."""
+
+    task: str
+    start: str
+    ground: str
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """What its files are called by."""
+        return f"{self.task}-{self.start.replace(' ', '_')}-{self.ground}-{self.seed}"
+
+
+def list_rollouts(object: str, count: int) -> list[Rollout]:
+    """``count`` rollouts of an object, its tasks, their starts and the grounds in turn."""
+    kinds = [(task.name, start) for task in TASKS.values() if task.object == object for start in task.starts]
+    return [Rollout(*kinds[k % len(kinds)], GROUNDS[k // len(kinds) % len(GROUNDS)], k) for k in range(count)]
+
+
+def run_folding(
+    preset: str, root: Path, *, policies: Iterable[Policy] = tuple(POLICIES.values()), workers: int = 0,
+    scheduler: str = "", progress: bool = True,
+) -> Path:  # fmt: skip
+    """Run a preset's rollouts of some policies and write what came of them; ``workers`` as `run_jobs` has them.
+
+    Rows of other policies that the results hold stay. ValueError for a preset without rollouts.
+    """
+    check_choice("preset", preset, tuple(ROLLOUTS))
+    began, paths = time.monotonic(), Paths(root, preset)
+    bench = Bench(paths.generated / "folding", {"workers": workers, "scheduler": scheduler, "progress": progress})
+    out = paths.results / "folding.json"
+    rows = read_json(out)["policies"] if out.is_file() else {name: {} for name in OBJECTS}
+    policies = list(policies)
+    for object in OBJECTS:
+        rollouts = list_rollouts(object, ROLLOUTS[preset])
+        starts = bench.make_starts(rollouts)
+        kept = [rollout for rollout in rollouts if not read_state(starts[rollout]).about["fault"]]
+        found = bench.roll(policies, kept, starts)
+        reachable = {key for key, row in found.get("truth", {}).items() if row["success"]}
+        for policy in policies:
+            rows[object][policy.name] = summarise_rollouts(found[policy.name], reachable)
+        rows[object] = {name: rows[object][name] for name in POLICIES if name in rows[object]}
+    run = {"rollouts": ROLLOUTS[preset], "hardware": name_hardware(torch.device("cpu")),
+           "minutes": round((time.monotonic() - began) / 60, 1)}  # fmt: skip
+    return write_json(out, {"run": run, "policies": rows})
+
+
+class Bench:
+    """The files of a preset's rollouts in a ``folder``; ``how`` is what `run_jobs` is told of workers."""
+
+    def __init__(self, folder: Path, how: Mapping[str, Any]) -> None:
+        self.folder, self.how = Path(folder), dict(how)
+        self.demonstrated: dict[str, list[State]] = {}
+
+    def make_starts(self, rollouts: list[Rollout]) -> dict[Rollout, Path]:
+        """First states, and before them the states that the rollouts' demonstrations go through."""
+        for task in {rollout.task: TASKS[rollout.task] for rollout in rollouts}.values():
+            self.demonstrated.setdefault(task.name, self._demonstrate(task))
+        jobs = {r.name: start_job(TASKS[r.task], r.start, r.ground, r.seed) for r in rollouts}
+        files = run_jobs(jobs, self.folder / "starts", **self.how)
+        return {rollout: files[rollout.name] for rollout in rollouts}
+
+    def _demonstrate(self, task: Task) -> list[State]:
+        """The states before, between and after a task's looks, each look by its own places."""
+        folder, jobs = self.folder / "demonstrations", {f"{task.name}_0": demonstration_job(task, 0)}
+        states = [run_jobs(jobs, folder, **self.how)[f"{task.name}_0"]]
+        for number, look in enumerate(task.looks, 1):
+            moves = true_moves(look, read_state(states[0]).points, read_state(states[-1]))
+            name = f"{task.name}_{number}"
+            states.append(run_jobs({name: act_job(states[-1], moves)}, folder, **self.how)[name])
+        return [read_state(state) for state in states]
+
+    def make_demonstration(self, task: Task) -> Demonstration:
+        """What a policy is shown of a task: images, picks and places, and anchors where they are seen."""
+        looks = []
+        for moves, state in zip(task.looks, self.demonstrated[task.name], strict=False):
+            pixels = np.array(true_moves(moves, self.demonstrated[task.name][0].points, state), float)
+            anchors = [k for k in ANCHORS[task.object] if state.visible[k] and k not in [move.pick for move in moves]]
+            looks.append(Look(state.image, pixels.reshape(-1, 2, 2), state.xy[anchors].astype(float)))
+        return Demonstration(task.object, tuple(looks))
+
+    def roll(
+        self, policies: list[Policy], rollouts: list[Rollout], starts: dict[Rollout, Path]
+    ) -> dict[str, dict[str, dict[str, Any]]]:
+        """{policy: {rollout: how it ended}} of every policy from every first state."""
+        files = {(policy, rollout): starts[rollout] for policy in policies for rollout in rollouts}
+        answers: dict[tuple[Policy, Rollout], list[Answer]] = {arm: [] for arm in files}
+        for number in range(max(len(TASKS[rollout.task].looks) for rollout in rollouts)):
+            going = [arm for arm in files if len(TASKS[arm[1].task].looks) > number]
+            for arm in ProgressBar(going, desc="answer", disable=not self.how["progress"], leave=False):
+                answers[arm].append(self._answer(*arm, number, files[arm], answers[arm]))
+            names = {arm: f"{arm[0].name}-{arm[1].name}-{number}" for arm in going}
+            jobs = {names[arm]: act_job(files[arm], answers[arm][-1].moves.tolist()) for arm in going}
+            made = run_jobs(jobs, self.folder / "acts", **self.how)
+            files |= {arm: made[name] for arm, name in names.items()}
+        return {policy.name: {rollout.name: self._judge(rollout, files[policy, rollout], answers[policy, rollout])
+                              for rollout in rollouts} for policy in policies}  # fmt: skip
+
+    def _answer(self, policy: Policy, rollout: Rollout, number: int, file: Path, before: list[Answer]) -> Answer:
+        """The moves (px) of one look, kept as a file; asked anew where the state or the policy is another."""
+        state, task = read_state(file), TASKS[rollout.task]
+        place = self.folder / "answers" / f"{policy.name}-{rollout.name}-{number}.json"
+        mark = {"state": state.about["mark"], "policy": digest_policy(policy, task.object)}
+        kept = _read_answer(place, mark)
+        if kept is None:
+            kept = self._ask(policy, rollout, number, state, before[0].motion if before else None)
+            motion = None if kept.motion is None else _to_list(kept.motion)
+            write_json(place, {"mark": mark, "moves": kept.moves.tolist(), "motion": motion, "share": kept.share})
+        return kept
+
+    def _ask(self, policy: Policy, rollout: Rollout, number: int, state: State, motion: Motion | None) -> Answer:
+        task = TASKS[rollout.task]
+        shown = self.demonstrated[task.name]
+        look = self.make_demonstration(task).looks[number]
+        if policy.name == "truth":
+            return Answer(np.array(true_moves(task.looks[number], shown[0].points, state)), None, 1.0)
+        if policy.name == "random":
+            return Answer(draw_moves(look, state.mask, np.random.default_rng([rollout.seed, number])), None, 1.0)
+        match = ask(policy, task.object, look, state.image, state.mask)
+        answer = choose_moves(look, match, policy.chosen, lambda xy: find_on_table(xy, shown[number]),
+                              lambda xy: find_on_table(xy, state), motion=motion)  # fmt: skip
+        moves = answer.moves.reshape(-1, 2)
+        pixels = state.project(np.column_stack([moves, np.zeros(len(moves))])) if len(moves) else moves
+        return Answer(pixels.reshape(-1, 2, 2), answer.motion, answer.share)
+
+    def _judge(self, rollout: Rollout, file: Path, answers: list[Answer]) -> dict[str, Any]:
+        state, task = read_state(file), TASKS[rollout.task]
+        group = load_group(task.object, DEFAULT_GROUP[task.object]).permutations
+        end, side = self.demonstrated[task.name][-1].points, SIDES_M[task.object]
+        outcome = measure_outcome(state.points.astype(float), end.astype(float), group, task.object)
+        failed = bool(state.about["fault"])
+        return {"task": task.name, "error": outcome.error_m / side, "overlap": outcome.overlap,
+                "success": not failed and outcome.error_m < SUCCESS * side, "fault": state.about["fault"],
+                "share": min(answer.share for answer in answers)}  # fmt: skip
+
+
+def find_on_table(xy: np.ndarray, state: State) -> np.ndarray:
+    """Where (…, 2) m on the table pixels (…, 2) of a state's image lie; NaN stays NaN."""
+    rays = compute_rays(xy, state.intrinsics) @ state.camera_pose[:3, :3].T
+    eye = state.camera_pose[:3, 3]
+    return eye[:2] - rays[..., :2] * (eye[2] / rays[..., 2:])
+
+
+def summarise_rollouts(rows: dict[str, dict[str, Any]], reachable: set[str]) -> dict[str, Any]:
+    """Errors (share of the side), overlap and success of all rollouts, of those ``reachable``, by task; caution.
+
+    ``reachable`` are the rollouts that the true matches succeed in: the others say something of the bench. "cautious":
+    success of those where at least `AGREES` of the questions agree, and how many these are.
+    """
+    groups = {"all": list(rows.values()), "reachable": [row for name, row in rows.items() if name in reachable]}
+    groups |= {task: [row for row in rows.values() if row["task"] == task] for task in TASKS}
+    said = {name: {key: estimate_mean([min(row[key], 1.0) for row in found]) for key in ("error", "overlap", "success")}
+            for name, found in groups.items() if found}  # fmt: skip
+    sure = [float(row["success"]) for name, row in rows.items() if row["share"] >= AGREES and name in reachable]
+    each = {name: [round(min(row["error"], 1.0), 4), bool(row["success"])] for name, row in rows.items()}
+    faults = sum(bool(row["fault"]) for row in rows.values())
+    return {**said, "cautious": estimate_mean(sure), "faults": faults, "rollouts": each}
+
+
+def _read_answer(path: Path, mark: dict[str, str]) -> Answer | None:
+    """What is kept of the same question; a damaged file is set aside."""
+    if not path.is_file():
+        return None
+    try:
+        kept = read_json(path)
+        if kept["mark"] != mark:
+            return None
+        motion = None if kept["motion"] is None else Motion(*(complex(*pair) for pair in kept["motion"]))
+        return Answer(np.array(kept["moves"], float).reshape(-1, 2, 2), motion, float(kept["share"]))
+    except (DamagedFileError, KeyError, TypeError, ValueError):
+        set_aside(path)
+        return None
+
+
+def _to_list(motion: Motion) -> list[list[float]]:
+    return [[value.real, value.imag] for value in (motion.factor, motion.shift)]
+
+
+def main() -> None:
+    """Run the bench of a preset."""
+    parser = argparse.ArgumentParser(prog="python -m mmgsd.fold.rollouts", description=__doc__.split("\n")[0])
+    parser.add_argument("preset", choices=tuple(ROLLOUTS))
+    parser.add_argument("--only", default="", help="policies whose name holds this text; their rows alone are written")
+    parser.add_argument("--workers", type=int, default=0, help="child processes at once (default: one a core)")
+    parser.add_argument("--scheduler", default="", help="address of a Dask scheduler; none: this machine")
+    args = parser.parse_args()
+    policies = [policy for policy in POLICIES.values() if args.only in policy.name or policy.name == "truth"]
+    if not any(args.only in policy.name for policy in policies):
+        parser.error(f"--only {args.only!r}: no policy has a name with that; there are {', '.join(POLICIES)}")
+    print(run_folding(args.preset, find_root(), policies=policies, workers=args.workers, scheduler=args.scheduler))
+
+
+if __name__ == "__main__":
+    run_command(main, kept="finished states and answers are kept, and the same command goes on")
