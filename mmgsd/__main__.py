@@ -52,6 +52,7 @@ def make_parser() -> argparse.ArgumentParser:
     _add_match(commands.add_parser("match", help="find all matches of pixels of an image in others", epilog=EXAMPLE))
     _add_segment(commands.add_parser("segment", help="write where an image shows the object"))
     _add_measure(commands.add_parser("measure", help="measure on photographs with marked corners or ends"))
+    _add_fold(commands.add_parser("fold", help="say where to pick and place in a picture, as a demonstration did"))
     _add_export(commands.add_parser("export", help="write a network as ONNX: image in, descriptors out"))
     for name, command in commands.choices.items():
         default = {"default": "cloth"} if name == "measure" else {"required": True}
@@ -94,6 +95,15 @@ def _add_match(match: argparse.ArgumentParser) -> None:
     match.set_defaults(run=cli.match)
 
 
+def _add_fold(fold: argparse.ArgumentParser) -> None:
+    fold.add_argument("demonstration", type=Path, metavar="DEMO.json", help="see docs/folding.md")
+    fold.add_argument("image", type=Path, help="a picture of the present state")
+    fold.add_argument("--look", type=int, default=0, help="which of the demonstration's looks (default: 0, the first)")
+    fold.add_argument("--intrinsics", type=_parse_intrinsics, metavar="FX,FY,CX,CY", help="px; prints rays too")
+    fold.add_argument("--json", action="store_true", help="print the answer as JSON")
+    fold.set_defaults(run=cli.fold)
+
+
 def _add_segment(segment: argparse.ArgumentParser) -> None:
     segment.add_argument("image", type=Path, help="the image to look at")
     segment.add_argument("out", type=Path, help="the mask to write, .png: brighter than half on the object")
@@ -128,6 +138,18 @@ def _parse_picture(text: str) -> Path:
     if Path(text).suffix.lower() not in PICTURES:
         raise argparse.ArgumentTypeError(f"must end with .png, .jpg, .pdf or .svg, got {text!r}")
     return Path(text)
+
+
+def _parse_intrinsics(text: str) -> tuple[float, ...]:
+    try:
+        numbers = tuple(map(float, text.split(",")))
+    except ValueError:
+        numbers = ()
+    if len(numbers) != 4 or not min(numbers[:2]) > 0:
+        raise argparse.ArgumentTypeError(
+            f"must be FX,FY,CX,CY, four numbers in px, the first two above 0, got {text!r}"
+        )
+    return numbers
 
 
 def _parse_number(text: str) -> int | str:

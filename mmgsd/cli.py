@@ -212,3 +212,28 @@ def heads(args: argparse.Namespace) -> None:
     from mmgsd.measure.heads import evaluate_heads
 
     print(json.dumps(read_json(evaluate_heads(args.weights, args.data, EvaluateConfig(pairs=100), args.out))))
+
+
+def fold(args: argparse.Namespace) -> None:
+    """Say where to pick and place in a picture, as a demonstration did."""
+    from mmgsd.fold.demonstration import read_demonstration
+    from mmgsd.fold.moves import answer_picture
+    from mmgsd.match.camera import compute_rays
+
+    demonstration, image = read_demonstration(args.demonstration), mmgsd.read_image(args.image)
+    answer = answer_picture(mmgsd.load(args.weights), demonstration, image, look=args.look)
+    moves = [{"pick": pick, "place": place} for pick, place in answer.moves.round(1).tolist()]
+    if args.intrinsics:
+        fx, fy, cx, cy = args.intrinsics
+        rays = compute_rays(answer.moves, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])).round(5).tolist()
+        moves = [
+            {**move, "pick_ray": pick, "place_ray": place} for move, (pick, place) in zip(moves, rays, strict=True)
+        ]
+    if args.json:
+        print(json.dumps({"moves": moves, "agreement": round(answer.share, 3)}), flush=True)
+        return
+    for move in moves:
+        told = {name: ",".join(f"{number:g}" for number in numbers) for name, numbers in move.items()}
+        rays = f" (rays {told['pick_ray']} and {told['place_ray']})" if args.intrinsics else ""
+        print(f"pick {told['pick']} place {told['place']}{rays}")
+    print(f"{answer.share:.0%} of the demonstration's pixels agree", flush=True)

@@ -25,7 +25,8 @@ from mmgsd.files import DamagedFileError, read_json, set_aside, write_json
 from mmgsd.fold.agreement import Motion
 from mmgsd.fold.demonstration import Demonstration, Look
 from mmgsd.fold.measures import SIDES_M, SUCCESS, estimate_mean, measure_outcome
-from mmgsd.fold.policies import POLICIES, Answer, Policy, ask, choose_moves, digest_policy, draw_moves
+from mmgsd.fold.moves import Answer, choose_moves
+from mmgsd.fold.policies import POLICIES, Policy, ask, digest_policy, draw_moves
 from mmgsd.fold.tasks import GROUNDS, TASKS, Task
 from mmgsd.learn.training import name_hardware
 from mmgsd.match.camera import compute_rays

@@ -1,0 +1,87 @@
+"""From matches to moves: which modes are grasped, and where what is grasped is laid down."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from mmgsd.fold.agreement import RADIUS, Motion, find_agreement, fit_motion_to, to_complex
+from mmgsd.fold.demonstration import Demonstration, Look
+from mmgsd.match.match import Match
+from mmgsd.match.matcher import Matcher
+
+Plane = Callable[[np.ndarray], np.ndarray]  # pixels (…, 2) to places (…, 2) of the plane that motions are in
+AGREE, BEST = "agree", "best"  # how one mode of each question is chosen
+LEAST = 0.5  # share of the questions that must agree before a picture of a user's is answered
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """Moves (M, 2, 2) of the plane, pick and place; none where nothing agrees. ``motion`` is kept for later looks."""
+
+    moves: np.ndarray
+    motion: Motion | None
+    share: float  # of the questions that agree with the motion
+
+
+def choose_moves(
+    look: Look, match: Match, chosen: str, seen: Plane, shown: Plane, *, motion: Motion | None = None,
+    free_scale: bool = False,
+) -> Answer:  # fmt: skip
+    """Picks and places from the matches of a look's picks and anchors (`Look.asked`).
+
+    ``seen`` and ``shown`` take pixels of the look's image and of the new one to the plane. "agree": the motion that
+    most modes agree with, or that of an earlier look; each pick is its mode near to where the motion takes it, or that
+    place. "best": each pixel's `Match.best`, and the motion that fits them all. Places are where the motion takes them.
+    """
+    asked, modes = seen(look.asked), shown(match.modes)
+    picks, places = seen(look.moves[:, 0]), seen(look.moves[:, 1])
+    if chosen == BEST:
+        surest = shown(match.best().xy)
+        known = np.isfinite(surest).all(1)
+        if not known[: len(picks)].all() or known.sum() < 2:
+            return Answer(np.zeros((0, 2, 2)), None, 0.0)
+        motion = fit_motion_to(asked[known], surest[known], free_scale=free_scale)
+        return Answer(np.stack([surest[: len(picks)], motion.apply(places)], 1), motion, float(known.mean()))
+    share = 1.0
+    if motion is None:
+        agreement = find_agreement(asked, modes, match.weights, free_scale=free_scale)
+        if agreement is None:
+            return Answer(np.zeros((0, 2, 2)), None, 0.0)
+        motion, share = agreement.motion, agreement.share
+    reach = 2 * RADIUS * float(np.abs(to_complex(asked - asked.mean(0))).max()) * abs(motion.factor)
+    wanted = motion.apply(picks)  # (M, 2)
+    distance = np.nan_to_num(np.linalg.norm(modes[: len(picks)] - wanted[:, None], axis=-1), nan=np.inf)  # (M, n)
+    nearest = distance.argmin(1)
+    near = distance[np.arange(len(picks)), nearest] <= reach
+    grasped = np.where(near[:, None], modes[np.arange(len(picks)), nearest], wanted)
+    return Answer(np.stack([grasped, motion.apply(places)], 1), motion, share)
+
+
+def answer_picture(matcher: Matcher, demonstration: Demonstration, image: np.ndarray, *, look: int = 0) -> Answer:
+    """Moves (M, 2, 2) px in a picture (H, W, 3) uint8 of the present state, as one look of a demonstration made them.
+
+    The picture is taken from about where the demonstration's was: a turn, a shift and a scale lead from one to the
+    other. ValueError for a look that there is not, weights of another object, a picture that does not show the object,
+    a pick off the object, and where fewer than `LEAST` of the look's picks and anchors agree.
+    """
+    count = len(demonstration.looks)
+    if look not in range(count):
+        raise ValueError(f"look must be from 0 to {count - 1}, got {look!r}")
+    if matcher.object and matcher.object != demonstration.object:
+        raise ValueError(f"weights must be of the demonstration's object {demonstration.object!r}, got weights of "
+                         f"{matcher.object!r}")  # fmt: skip
+    shown = demonstration.looks[look]
+    match = matcher.match(shown.image, image, shown.asked)
+    if match.on_object is not None and (match.on_object < 0.5).any():
+        off = shown.asked[match.on_object < 0.5].tolist()
+        raise ValueError(f"picks and anchors must be on the object of the demonstration, these are not: {off}")
+    if match.absent is not None and match.absent[0] > 0.5:
+        raise ValueError(f"the picture must show a {demonstration.object}, none is seen in it")
+    answer = choose_moves(shown, match, AGREE, np.asarray, np.asarray, free_scale=True)
+    if answer.share < LEAST:
+        raise ValueError(f"the picture's answers must agree with the demonstration, {answer.share:.0%} of them do: "
+                         "take it from where the demonstration was taken, or add anchors")  # fmt: skip
+    return answer

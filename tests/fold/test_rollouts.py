@@ -1,0 +1,123 @@
+"""The bench goes in step and goes on: states that are made, and answers that are given, are kept."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mmgsd.fold import rollouts
+from mmgsd.fold.policies import POLICIES
+from mmgsd.fold.rollouts import find_on_table, list_rollouts, run_folding, summarise_rollouts
+from mmgsd.fold.tasks import GROUNDS, TASKS
+from mmgsd.scene.state import State, read_state, write_state
+
+ASKED = [POLICIES["truth"], POLICIES["random"]]
+ROW, COLUMN = np.divmod(np.arange(625), 25)
+FLAT = {"cloth": np.stack([COLUMN / 24 - 0.5, 0.5 - ROW / 24, np.zeros(625)], 1),
+        "rope": np.stack([np.linspace(-0.8, 0.8, 625), np.zeros(625), np.zeros(625)], 1)}  # fmt: skip
+POSE = np.array([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 2.5], [0, 0, 0, 1]])  # above the table, looking down
+MATRIX = np.array([[60.0, 0, 49.5], [0, 60, 49.5], [0, 0, 1]])
+
+
+def lay(object: str, about: dict, *, moved: float = 0.0) -> State:
+    points = FLAT[object] + (moved, 0, 0)
+    mask = np.zeros((100, 100), bool)
+    mask[35:65, 35:65] = True
+    state = State(points.astype(np.float32), points.astype(np.float32), np.zeros((100, 100, 3), np.uint8), mask,
+                  np.zeros((625, 2), np.float32), np.ones(625, bool), MATRIX, POSE, FLAT[object].astype(np.float32),
+                  about)  # fmt: skip
+    return State(**{**state.__dict__, "xy": state.project(points).astype(np.float32)})
+
+
+@pytest.fixture
+def physics(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """States without Blender: nothing moves, and an act shifts by a metre what it does not grasp truly."""
+    made: list[str] = []
+
+    def run(jobs: dict[str, dict], folder: Path, **_: object) -> dict[str, Path]:
+        files = {}
+        for name, job in jobs.items():
+            files[name] = folder / f"{name}.npz"
+            if files[name].is_file():
+                continue
+            made.append(name)
+            folder.mkdir(parents=True, exist_ok=True)
+            if job["kind"] == "act":
+                before = read_state(job["state"]).about
+                about = {**before, "look": before["look"] + 1, "mark": job["mark"]}
+            else:
+                about = {key: job[key] for key in ("object", "task", "start", "ground", "seed")}
+                about |= {"fault": "", "look": 0, "mark": job["mark"], "thickness": 0.0}
+            write_state(files[name], lay(about["object"], about))
+        return files
+
+    monkeypatch.setattr(rollouts, "run_jobs", run)
+    return made
+
+
+def test_rollouts_go_through_tasks_starts_and_grounds_in_turn() -> None:
+    found = list_rollouts("cloth", 40)
+    assert len({rollout.name for rollout in found}) == 40
+    assert {rollout.task for rollout in found} == {name for name, task in TASKS.items() if task.object == "cloth"}
+    assert {rollout.ground for rollout in found} == set(GROUNDS)
+    assert all(rollout.start in TASKS[rollout.task].starts for rollout in found)
+    assert list_rollouts("cloth", 10) == found[:10]
+
+
+def test_a_run_makes_every_state_once_and_a_second_none(tmp_path: Path, physics: list[str]) -> None:
+    out = run_folding("smoke", tmp_path, policies=ASKED, progress=False)
+    results = json.loads(out.read_text())
+    assert results["run"]["rollouts"] == 2
+    assert list(results["policies"]["cloth"]) == ["truth", "random"]
+    assert results["policies"]["cloth"]["truth"]["all"]["error"]["count"] == 2
+    assert len(physics) == len(set(physics)) and any(name.startswith("random-edge") for name in physics)
+    count = len(physics)
+    again = json.loads(run_folding("smoke", tmp_path, policies=ASKED, progress=False).read_text())
+    assert len(physics) == count and again["policies"] == results["policies"]
+
+
+def test_an_interrupted_run_goes_on_from_its_files(tmp_path: Path, physics: list[str]) -> None:
+    run_folding("smoke", tmp_path, policies=ASKED, progress=False)
+    answers = sorted((tmp_path / "data/generated/smoke/folding/answers").iterdir())
+    kept = {path: path.read_bytes() for path in answers}
+    answers[0].unlink()
+    answers[1].write_text("{")
+    with pytest.warns(UserWarning, match="damaged"):
+        run_folding("smoke", tmp_path, policies=ASKED, progress=False)
+    assert all(path.read_bytes() == content for path, content in kept.items())
+
+
+def test_rows_of_other_policies_stay(tmp_path: Path, physics: list[str]) -> None:
+    run_folding("smoke", tmp_path, policies=ASKED, progress=False)
+    results = json.loads(run_folding("smoke", tmp_path, policies=ASKED[:1], progress=False).read_text())
+    assert list(results["policies"]["rope"]) == ["truth", "random"]
+
+
+def test_another_preset_has_no_rollouts(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="preset must be one of 'smoke', 'quick', 'paper'"):
+        run_folding("workspace", tmp_path)
+
+
+def test_pixels_and_places_on_the_table_belong_together() -> None:
+    state = lay("cloth", {})
+    np.testing.assert_allclose(find_on_table(state.xy, state), FLAT["cloth"][:, :2], atol=1e-5)
+
+
+def test_a_summary_tells_all_from_what_was_reachable() -> None:
+    rows = {
+        "a": {"task": "edge", "error": 0.01, "overlap": 0.9, "success": True, "fault": "", "share": 1.0},
+        "b": {"task": "edge", "error": 0.30, "overlap": 0.5, "success": False, "fault": "", "share": 0.2},
+        "c": {"task": "unfold", "error": np.inf, "overlap": 0.0, "success": False, "fault": "nowhere", "share": 1.0},
+    }
+    said = summarise_rollouts(rows, {"a", "b"})
+    assert said["all"]["success"]["mean"] == pytest.approx(1 / 3, abs=1e-4) and said["all"]["error"]["count"] == 3
+    assert said["reachable"]["success"]["mean"] == 0.5 and said["cautious"] == {
+        **said["cautious"],
+        "mean": 1.0,
+        "count": 1,
+    }
+    assert said["edge"]["error"]["mean"] == pytest.approx(0.155) and said["faults"] == 1
+    assert said["rollouts"]["c"] == [1.0, False]
