@@ -1,6 +1,6 @@
 """The bench: rollouts of every policy from the same first states, as files, and what came of them.
 
-    python -m mmgsd.fold.rollouts quick              -> data/results/quick/folding.json
+    python -m mmgsd.fold.rollouts quick         -> data/results/quick/folding.json, figures/quick/folding.jpg
     python -m mmgsd.fold.rollouts quick --only mmgsd       those policies whose name holds that text
 
 All go in step: first states, every policy's answers, what physics makes of them, the next look. A killed run goes on.
@@ -21,6 +21,8 @@ import torch
 from mmgsd.checks import check_choice
 from mmgsd.command import run_command
 from mmgsd.config import DEFAULT_GROUP, OBJECTS, Paths, find_root
+from mmgsd.figures.folding import plot_rollouts
+from mmgsd.figures.style import save_figure
 from mmgsd.files import DamagedFileError, read_json, set_aside, write_json
 from mmgsd.fold.agreement import Motion
 from mmgsd.fold.demonstration import Demonstration, Look
@@ -66,7 +68,9 @@ def run_folding(
     preset: str, root: Path, *, policies: Iterable[Policy] = tuple(POLICIES.values()), workers: int = 0,
     scheduler: str = "", progress: bool = True,
 ) -> Path:  # fmt: skip
-    """Run a preset's rollouts of some policies and write what came of them; ``workers`` as `run_jobs` has them.
+    """Run a preset's rollouts of some policies, write what came of them, and draw one of each task.
+
+    ``workers`` and ``scheduler`` are as `run_jobs` has them.
 
     Rows of other policies that the results hold stay. ValueError for a preset without rollouts.
     """
@@ -75,18 +79,20 @@ def run_folding(
     bench = Bench(paths.generated / "folding", {"workers": workers, "scheduler": scheduler, "progress": progress})
     out = paths.results / "folding.json"
     rows = read_json(out)["policies"] if out.is_file() else {name: {} for name in OBJECTS}
-    policies = list(policies)
+    policies, pictures = list(policies), {}
     for object in OBJECTS:
         rollouts = list_rollouts(object, ROLLOUTS[preset])
         starts = bench.make_starts(rollouts)
         kept = [rollout for rollout in rollouts if not read_state(starts[rollout]).about["fault"]]
         found = bench.roll(policies, kept, starts)
+        pictures |= bench.list_pictures(policies, kept, starts)
         reachable = {key for key, row in found.get("truth", {}).items() if row["success"]}
         for policy in policies:
             rows[object][policy.name] = summarise_rollouts(found[policy.name], reachable)
         rows[object] = {name: rows[object][name] for name in POLICIES if name in rows[object]}
     run = {"rollouts": ROLLOUTS[preset], "hardware": name_hardware(torch.device("cpu")),
            "minutes": round((time.monotonic() - began) / 60, 1)}  # fmt: skip
+    save_figure(plot_rollouts(pictures), paths.figures / "folding", kinds=("jpg",))
     return write_json(out, {"run": run, "policies": rows})
 
 
@@ -96,6 +102,7 @@ class Bench:
     def __init__(self, folder: Path, how: Mapping[str, Any]) -> None:
         self.folder, self.how = Path(folder), dict(how)
         self.demonstrated: dict[str, list[State]] = {}
+        self.ends: dict[tuple[Policy, Rollout], Path] = {}
 
     def make_starts(self, rollouts: list[Rollout]) -> dict[Rollout, Path]:
         """First states, and before them the states that the rollouts' demonstrations go through."""
@@ -138,8 +145,28 @@ class Bench:
             jobs = {names[arm]: act_job(files[arm], answers[arm][-1].moves.tolist()) for arm in going}
             made = run_jobs(jobs, self.folder / "acts", **self.how)
             files |= {arm: made[name] for arm, name in names.items()}
+        self.ends |= files
         return {policy.name: {rollout.name: self._judge(rollout, files[policy, rollout], answers[policy, rollout])
                               for rollout in rollouts} for policy in policies}  # fmt: skip
+
+    def list_pictures(
+        self, policies: list[Policy], rollouts: list[Rollout], starts: dict[Rollout, Path]
+    ) -> dict[str, dict[str, np.ndarray]]:
+        """{task's label: {what is seen: picture}} of a rollout of each task: demonstration, start, policies' ends."""
+        first = {rollout.task: rollout for rollout in reversed(rollouts)}
+        rows = {}
+        for task in (task for task in TASKS.values() if task.name in first):
+            shown, rollout = self.demonstrated[task.name], first[task.name]
+            row = {
+                "demonstrated": shown[0].image,
+                "its end": shown[-1].image,
+                "found": read_state(starts[rollout]).image,
+            }
+            ends = {
+                policy.label.replace(", ", ",\n"): read_state(self.ends[policy, rollout]).image for policy in policies
+            }
+            rows[task.label.replace(" ", "\n", 1)] = row | ends
+        return rows
 
     def _answer(self, policy: Policy, rollout: Rollout, number: int, file: Path, before: list[Answer]) -> Answer:
         """The moves (px) of one look, kept as a file; asked anew where the state or the policy is another."""

@@ -1,0 +1,33 @@
+"""Pictures of rollouts: a row a task, a column a picture, the middle square of each."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mmgsd.figures.folding import THUMBNAIL_PX, crop_square, plot_rollouts
+
+PICTURE = np.zeros((48, 64, 3), np.uint8)
+
+
+def test_a_row_a_task_and_a_column_a_picture() -> None:
+    figure = plot_rollouts(
+        {"in half": {"found": PICTURE, "MMGSD": PICTURE}, "unfold": dict(found=PICTURE, MMGSD=PICTURE)}
+    )
+    assert len(figure.axes) == 4
+    assert [axis.get_title() for axis in figure.axes] == ["found", "MMGSD", "", ""]
+    assert [axis.get_ylabel() for axis in figure.axes] == ["in half", "", "unfold", ""]
+
+
+def test_tasks_of_other_columns_and_none_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"the columns \['found'\] for each task, got \['MMGSD'\] of 'unfold'"):
+        plot_rollouts({"in half": {"found": PICTURE}, "unfold": {"MMGSD": PICTURE}})
+    with pytest.raises(ValueError, match="pictures"):
+        plot_rollouts({})
+
+
+def test_the_middle_square_is_shown() -> None:
+    picture = PICTURE.copy()
+    picture[:, 8:56] = 255
+    cropped = crop_square(picture)
+    assert cropped.shape == (THUMBNAIL_PX, THUMBNAIL_PX, 3) and cropped.min() == 255
