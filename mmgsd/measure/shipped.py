@@ -87,10 +87,12 @@ def measure_weights(
     return row | _time_question(matcher, root)
 
 
-def measure_read(name: str, root: Path, *, photographs: Path | None = None, progress: bool = True) -> dict[str, Any]:
+def measure_read(
+    name: str, root: Path, *, photographs: Path | None = None, presets: Sequence[str] = SETS, progress: bool = True
+) -> dict[str, Any]:
     """The row of shipped weights whose modes are read otherwise: "cloth@1,1" with power 1 and sharpness 1, at means.
 
-    `mmgsd.measure.metrics.aggregate` over visible sources of each of `SETS`, and photographs. ValueError for other
+    `mmgsd.measure.metrics.aggregate` over visible sources of each of ``presets``, and photographs. ValueError for other
     numbers, FileNotFoundError for other weights.
     """
     weights, _, numbers = name.partition("@")
@@ -99,7 +101,7 @@ def measure_read(name: str, root: Path, *, photographs: Path | None = None, prog
     reading = matcher.reading = parse_reading(numbers, matcher.reading)
     row: dict[str, Any] = {"object": matcher.object, "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
                            "power": reading.power, "sharpness": reading.sharpness}  # fmt: skip
-    for preset in SETS:
+    for preset in presets:
         paths = Paths(root, preset)
         data, out = paths.dataset(matcher.object), paths.queries(f"shipped-{name}")
         queries = load_queries(evaluate_model(file, data, load_preset(preset).evaluate, out, reading=reading,
@@ -198,16 +200,16 @@ def measure_study(
             for key, file in files.items()}  # fmt: skip
 
 
-def _measure(name: str, root: Path, photographs: Path | None, preset: str, steps: int) -> dict[str, dict[str, Any]]:
+def _measure(name: str, root: Path, args: argparse.Namespace) -> dict[str, dict[str, Any]]:
     """The rows of a name that is asked for."""
-    how = {"photographs": photographs}
+    how = {"photographs": args.photographs}
     if name in BASELINES:
         return {f"{object}-{name}": measure_baseline(name, object, root, **how) for object in OBJECTS}
     if "@" in name:
-        return {name: measure_read(name, root, **how)}
+        return {name: measure_read(name, root, presets=() if args.photographs_alone else SETS, **how)}
     if name != STUDY:
         return {name: measure_weights(name, root, **how)}
-    return measure_study(root, load_preset(preset), steps=steps, **how)
+    return measure_study(root, load_preset(args.preset), steps=args.steps, **how)
 
 
 def main() -> None:
@@ -220,18 +222,21 @@ def main() -> None:
         help=f"weights in data/weights, alone or with @POWER,SHARPNESS, {', '.join(BASELINES)}, or {STUDY}",
     )
     parser.add_argument("--photographs", type=Path, metavar="FOLDER", help="marked photographs, with index.json")
+    parser.add_argument(
+        "--photographs-alone", action="store_true", help="of names with an @, leave the renders out: they take longest"
+    )
     parser.add_argument("--preset", default=SETS[0], choices=tuple(PRESETS), help=f"whose {STUDY} (default: {SETS[0]})")
     parser.add_argument("--steps", type=int, default=0, help=f"of each model of {STUDY} (default: the study's own)")
     args = parser.parse_args()
-    root, study = find_root(), (args.preset, read_count("--steps", args.steps))
+    root, args.steps = find_root(), read_count("--steps", args.steps)
     out = root / "data" / "results" / RESULTS
     for name in args.names:
-        rows = _measure(name, root, args.photographs, *study)
+        rows = _measure(name, root, args)
         kept = read_results(out)
         for key, row in rows.items():  # photographs are not at everybody's hand: a call without them keeps the row's
             before = kept.get(key, {})
-            same = before.get("sha256") == row.get("sha256")
-            kept[key] = ({"photographs": before["photographs"]} if same and "photographs" in before else {}) | row
+            parts = ("photographs", *SETS) if before.get("sha256") == row.get("sha256") else ()
+            kept[key] = {part: before[part] for part in parts if part in before} | row
         print(f"{write_json(out, kept)}: {', '.join(rows)}")
 
 

@@ -118,6 +118,19 @@ def test_another_reading_is_two_numbers(root: Path, name: str) -> None:
         measure_read(name, root, progress=False)
 
 
+def test_photographs_alone_keep_what_renders_gave(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    results = root / "data" / "results" / "shipped.json"
+    monkeypatch.setattr(sys, "argv", [sys.executable, "mine@2,4"])
+    main()
+    before = json.loads(results.read_text())["mine@2,4"]
+    monkeypatch.setattr(shipped, "read_photographs", lambda *_: [])
+    monkeypatch.setattr(shipped, "measure_answers", lambda *_, **__: {"best": 3.0})
+    monkeypatch.setattr(shipped, "evaluate_model", None)  # not asked
+    monkeypatch.setattr(sys, "argv", [sys.executable, "mine@2,4", "--photographs", "somewhere", "--photographs-alone"])
+    main()
+    assert json.loads(results.read_text())["mine@2,4"] == before | {"photographs": {"best": 3.0}}
+
+
 def test_modes_are_not_read_flatter_from_a_name_either(root: Path) -> None:
     with pytest.raises(ValueError, match="power must be at least 1, got 0.5"):
         measure_read("mine@0.5,1", root, progress=False)
