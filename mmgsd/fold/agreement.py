@@ -12,6 +12,7 @@ from itertools import combinations
 import numpy as np
 
 RADIUS = 0.08  # of the questions' extent: as near as a mode is to where the motion takes its pixel, where both agree
+ROUNDS = 8  # in which questions take their nearest modes, and the motion is fitted again
 MAX_SCALE = 1.25  # of two questions' distance, by which it may grow or shrink where the scale is known
 
 
@@ -57,7 +58,7 @@ def find_agreement(
     questions, or all at one place.
     """
     source, target = to_complex(asked), to_complex(modes)  # (S,), (S, n)
-    extent = np.abs(source - source.mean()).max() if len(source) else 0.0
+    extent = find_extent(asked)
     if len(source) < 2 or not extent > 0:
         raise ValueError(f"asked must be at least two places, got {np.asarray(asked).tolist()}")
     weights = np.where(np.isfinite(target), weights, 0.0)
@@ -120,3 +121,54 @@ def fit_motion_to(source: np.ndarray, target: np.ndarray, *, free_scale: bool = 
         raise ValueError(f"source and target must be as many points, two or more, got {len(source)} and {len(target)}")
     ones, start = np.ones((len(source), 1)), np.array([1.0, 0.0], complex)
     return Motion(*map(complex, _fit(to_complex(source), to_complex(target)[:, None], ones, start, free_scale)))
+
+
+def find_extent(points: np.ndarray) -> float:
+    """The distance of the farthest of points (N, 2) from their mean; 0 of none."""
+    points = np.asarray(points, float)
+    return float(np.linalg.norm(points - points.mean(0), axis=1).max()) if len(points) else 0.0
+
+
+def settle_motion(asked: np.ndarray, modes: np.ndarray, motion: Motion, *, free_scale: bool = False) -> Motion:
+    """The motion that best takes each question of (S, 2) to the nearest of its modes (S, n, 2), found from another one.
+
+    For an object that is bent otherwise than shown: all questions count, not those alone that agree. Besl and McKay, "A
+    method for registration of 3-D shapes" (1992). Questions without a mode do not count; of fewer than two, the same.
+    """
+    for _ in range(ROUNDS):
+        nearest = _take_nearest(motion.apply(asked), modes)
+        known = np.isfinite(nearest).all(1)
+        if known.sum() < 2:
+            return motion
+        motion = fit_motion_to(asked[known], nearest[known], free_scale=free_scale)
+    return motion
+
+
+def _take_nearest(wanted: np.ndarray, modes: np.ndarray) -> np.ndarray:
+    """(S, 2): of each question's modes (S, n, 2) the one nearest to a place (S, 2); NaN of none."""
+    distance = np.nan_to_num(np.linalg.norm(modes - wanted[:, None], axis=-1), nan=np.inf)
+    return modes[np.arange(len(modes)), distance.argmin(1)]
+
+
+def take_apart(asked: np.ndarray, modes: np.ndarray, motion: Motion, *, apart: float) -> np.ndarray:
+    """(S, 2): the mode of (S, n, 2) that each question of (S, 2) takes, near to where the motion takes it.
+
+    No two take places less than ``apart`` from each other, unless the motion takes them there: whose second choice is
+    worst chooses first, and what is taken is no choice of the others; none (NaN) where nothing is left.
+    """
+    wanted, taken = motion.apply(asked), np.full((len(asked), 2), np.nan)
+    distance = np.nan_to_num(np.linalg.norm(modes - wanted[:, None], axis=-1), nan=np.inf)  # (S, n)
+    allowed = np.minimum(apart, np.linalg.norm(wanted[:, None] - wanted, axis=-1) / 2)  # (S, S)
+    left = set(range(len(asked)))
+    while left := {k for k in left if np.isfinite(distance[k]).any()}:
+        k = max(sorted(left), key=lambda k: _find_regret(distance[k]))
+        taken[k] = modes[k, distance[k].argmin()]
+        distance[np.linalg.norm(modes - taken[k], axis=-1) < allowed[k][:, None]] = np.inf
+        left.remove(k)
+    return taken
+
+
+def _find_regret(distance: np.ndarray) -> float:
+    """How much farther the second choice is than the first; infinite where there is none."""
+    first, second = np.sort(np.append(distance, np.inf))[:2]
+    return float(second - first)

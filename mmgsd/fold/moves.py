@@ -7,13 +7,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mmgsd.fold.agreement import RADIUS, Motion, find_agreement, fit_motion_to, to_complex
+from mmgsd.fold.agreement import (
+    RADIUS,
+    Motion,
+    find_agreement,
+    find_extent,
+    fit_motion_to,
+    settle_motion,
+    take_apart,
+)
 from mmgsd.fold.demonstration import Demonstration, Look
 from mmgsd.match.match import Match
 from mmgsd.match.matcher import Matcher
 
 Plane = Callable[[np.ndarray], np.ndarray]  # pixels (…, 2) to places (…, 2) of the plane that motions are in
 AGREE, BEST = "agree", "best"  # how one mode of each question is chosen
+RIGID = 0.7  # share of the questions that agree where an object lies as it was shown
 LEAST = 0.5  # share of the questions that must agree before a picture of a user's is answered
 
 
@@ -34,7 +43,9 @@ def choose_moves(
 
     ``seen`` and ``shown`` take pixels of the look's image and of the new one to the plane. "agree": the motion that
     most modes agree with, or that of an earlier look; each pick is its mode near to where the motion takes it, or that
-    place. "best": each pixel's `Match.best`, and the motion that fits them all. Places are where the motion takes them.
+    place. Where less than `RIGID` agree, the object is bent otherwise than shown: the motion is the best for all, and
+    each pick its nearest mode. "best": each pixel's `Match.best`, and the motion that fits them all. Places are where
+    the motion takes them.
     """
     asked, modes = seen(look.asked), shown(match.modes)
     picks, places = seen(look.moves[:, 0]), seen(look.moves[:, 1])
@@ -45,19 +56,21 @@ def choose_moves(
             return Answer(np.zeros((0, 2, 2)), None, 0.0)
         motion = fit_motion_to(asked[known], surest[known], free_scale=free_scale)
         return Answer(np.stack([surest[: len(picks)], motion.apply(places)], 1), motion, float(known.mean()))
-    share = 1.0
+    share, bent = 1.0, False
     if motion is None:
         agreement = find_agreement(asked, modes, match.weights, free_scale=free_scale)
         if agreement is None:
             return Answer(np.zeros((0, 2, 2)), None, 0.0)
-        motion, share = agreement.motion, agreement.share
-    reach = 2 * RADIUS * float(np.abs(to_complex(asked - asked.mean(0))).max()) * abs(motion.factor)
+        motion, share, bent = agreement.motion, agreement.share, agreement.share < RIGID
+    if bent:
+        motion = settle_motion(asked, modes, motion, free_scale=free_scale)
     wanted = motion.apply(picks)  # (M, 2)
-    distance = np.nan_to_num(np.linalg.norm(modes[: len(picks)] - wanted[:, None], axis=-1), nan=np.inf)  # (M, n)
-    nearest = distance.argmin(1)
-    near = distance[np.arange(len(picks)), nearest] <= reach
-    grasped = np.where(near[:, None], modes[np.arange(len(picks)), nearest], wanted)
-    return Answer(np.stack([grasped, motion.apply(places)], 1), motion, share)
+    radius = RADIUS * find_extent(asked) * abs(motion.factor)
+    grasped = take_apart(picks, modes[: len(picks)], motion, apart=radius)
+    reach = np.inf if bent else 2 * radius
+    with np.errstate(invalid="ignore"):
+        near = np.linalg.norm(grasped - wanted, axis=1) <= reach  # not where it is NaN
+    return Answer(np.stack([np.where(near[:, None], grasped, wanted), motion.apply(places)], 1), motion, share)
 
 
 def answer_picture(matcher: Matcher, demonstration: Demonstration, image: np.ndarray, *, look: int = 0) -> Answer:

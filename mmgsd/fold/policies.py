@@ -18,6 +18,8 @@ from mmgsd.match.match import Match
 from mmgsd.match.matcher import Matcher, find_weights
 from mmgsd.symmetry import load_group
 
+VERSION = 3  # to be raised where a policy answers the same question otherwise than before
+
 
 @dataclass(frozen=True)
 class Policy:
@@ -60,10 +62,10 @@ def load_matcher(policy: Policy, object: str) -> Any:
 
 @cache
 def digest_policy(policy: Policy, object: str) -> str:
-    """What a policy's answers depend on beside the pictures."""
+    """What a policy's answers depend on beside the pictures and the demonstration."""
     weights = "" if policy.matcher.isalpha() or not policy.chosen else find_weights(object + policy.matcher)
     content = weights.read_bytes() if weights else b""
-    return hashlib.sha256(repr(policy).encode() + content).hexdigest()[:16]
+    return hashlib.sha256(repr((VERSION, policy)).encode() + content).hexdigest()[:16]
 
 
 def ask(policy: Policy, object: str, look: Look, image: np.ndarray, mask: np.ndarray) -> Match:

@@ -5,7 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mmgsd.fold.agreement import Motion, find_agreement, fit_motion_to, to_complex, to_points
+from mmgsd.fold.agreement import (
+    Motion,
+    find_agreement,
+    fit_motion_to,
+    settle_motion,
+    take_apart,
+    to_complex,
+    to_points,
+)
 
 ASKED = np.array([[-0.4, 0.4], [0.4, 0.4], [0.4, -0.4], [-0.4, -0.4], [0.2, 0.05], [-0.3, 0.1]])
 TRUTH = Motion(np.exp(0.7j), 0.3 - 0.2j)
@@ -71,3 +79,26 @@ def test_a_motion_is_fitted_by_least_squares(rng: np.random.Generator) -> None:
     np.testing.assert_allclose([fitted.factor, fitted.shift], [TRUTH.factor, TRUTH.shift], atol=1e-9)
     with pytest.raises(ValueError, match="source and target must be as many points"):
         fit_motion_to(ASKED[:1], ASKED[:1])
+
+
+BENT = np.array([[-0.5, 0.3], [-0.4, 0.0], [0.0, -0.1], [0.4, 0.0], [0.5, 0.3]])  # a rope that was shown straight
+STRAIGHT = np.array([[-0.8, 0.0], [-0.4, 0.0], [0.0, 0.0], [0.4, 0.0], [0.8, 0.0]])
+
+
+def test_of_an_object_bent_otherwise_all_questions_count() -> None:
+    modes = np.stack([BENT, BENT[::-1]], 1)  # (5, 2, 2)
+    found = settle_motion(STRAIGHT, modes, Motion(np.exp(0.3j), 0.1 + 0.4j))
+    best = fit_motion_to(STRAIGHT, BENT)
+    np.testing.assert_allclose(found.apply(STRAIGHT), best.apply(STRAIGHT), atol=1e-9)
+    modes[1:] = np.nan
+    start = Motion(1 + 0j, 0j)
+    assert settle_motion(STRAIGHT, modes, start) is start  # one question tells no motion
+
+
+def test_no_two_questions_take_the_same_place() -> None:
+    ends = STRAIGHT[[0, 4]]
+    modes = np.stack([ends, ends], 0)  # both may be at either end
+    aside = Motion(1 + 0j, 0.9 + 0j)  # both are nearer to the right end
+    assert take_apart(ends, modes, aside, apart=0.1).tolist() == [[-0.8, 0.0], [0.8, 0.0]]
+    taken = take_apart(ends, modes[:, 1:], aside, apart=0.1)  # only the right end is known
+    assert np.isfinite(taken).all(1).sum() == 1
