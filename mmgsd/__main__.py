@@ -100,6 +100,7 @@ def _add_fold(fold: argparse.ArgumentParser) -> None:
     fold.add_argument("image", type=Path, help="a picture of the present state")
     fold.add_argument("--look", type=int, default=0, help="which of the demonstration's looks (default: 0, the first)")
     fold.add_argument("--intrinsics", type=_parse_intrinsics, metavar="FX,FY,CX,CY", help="px; prints rays too")
+    fold.add_argument("--out", type=_parse_picture, metavar="FILE", help="draw the moves (png, jpg, pdf or svg)")
     fold.add_argument("--json", action="store_true", help="print the answer as JSON")
     fold.set_defaults(run=cli.fold)
 

@@ -144,6 +144,13 @@ def draw_answer(answer: Any, path: Path) -> None:
     save_picture(answer.plot() if len(answer) == 1 else plot_page(answer), path)
 
 
+def draw_moves(look: Any, image: np.ndarray, moves: np.ndarray, path: Path) -> None:
+    """What a demonstration's look did, beside moves (M, 2, 2) px in an image."""
+    from mmgsd.figures.folding import plot_moves
+
+    save_picture(plot_moves({"demonstration": (look.image, look.moves), "now": (image, moves)}), path)
+
+
 def save_picture(figure: Any, path: Path) -> None:
     """A figure, as a file of the kind that its name ends with."""
     import matplotlib
@@ -221,7 +228,11 @@ def fold(args: argparse.Namespace) -> None:
     from mmgsd.match.camera import compute_rays
 
     demonstration, image = read_demonstration(args.demonstration), mmgsd.read_image(args.image)
+    if args.out and args.out.resolve() == args.image.resolve():
+        raise ValueError(f"--out must not be the image itself, got {args.out}")
     answer = answer_picture(mmgsd.load(args.weights), demonstration, image, look=args.look)
+    if args.out:
+        draw_moves(demonstration.looks[args.look], image, answer.moves, args.out)
     moves = [{"pick": pick, "place": place} for pick, place in answer.moves.round(1).tolist()]
     if args.intrinsics:
         fx, fy, cx, cy = args.intrinsics

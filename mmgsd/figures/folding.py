@@ -9,9 +9,30 @@ import numpy as np
 from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 
-from mmgsd.figures.style import PAGE_IN, check_filled, styled
+from mmgsd.figures.style import MARK, PAGE_IN, check_filled, finish_axes, make_grid, mark_pixel, styled
 
 THUMBNAIL_PX = 160  # sides of a picture
+PANEL_IN = 2.4  # width of a picture with moves
+
+
+@styled
+def plot_moves(pictures: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
+    """Pictures beside each other, each (H, W, 3) uint8 with its moves (M, 2, 2) px: an arrow from pick to place.
+
+    The keys are the titles. ValueError where there is no picture.
+    """
+    check_filled("pictures", pictures)
+    aspects = [max(image.shape[0] / image.shape[1] for image, _ in pictures.values())]
+    figure, axes = make_grid(aspects, len(pictures), PANEL_IN * len(pictures))
+    for axis, (title, (image, moves)) in zip(axes[0], pictures.items(), strict=True):
+        axis.imshow(image)
+        axis.autoscale(False)  # a place may lie outside
+        for pick, place in np.asarray(moves, float).reshape(-1, 2, 2):
+            for colour, width in (("black", 2.6), (MARK, 1.4)):  # seen on any ground
+                axis.annotate("", place, pick, arrowprops={"arrowstyle": "->", "color": colour, "lw": width})
+            mark_pixel(axis, *pick)
+        axis.set_title(title)
+    return finish_axes(figure)
 
 
 @styled
@@ -36,6 +57,7 @@ def plot_rollouts(pictures: Mapping[str, Mapping[str, np.ndarray]]) -> Figure:
         line[0].set_ylabel(task, fontsize=7)
     for axis, shown in zip(axes[0], columns, strict=True):
         axis.set_title(shown, fontsize=7)
+    plt.close(figure)  # a notebook shows what a cell returns; an open figure would appear twice
     return figure
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mmgsd.figures.folding import THUMBNAIL_PX, crop_square, plot_rollouts
+from mmgsd.figures.folding import THUMBNAIL_PX, crop_square, plot_moves, plot_rollouts
 
 PICTURE = np.zeros((48, 64, 3), np.uint8)
 
@@ -31,3 +31,15 @@ def test_the_middle_square_is_shown() -> None:
     picture[:, 8:56] = 255
     cropped = crop_square(picture)
     assert cropped.shape == (THUMBNAIL_PX, THUMBNAIL_PX, 3) and cropped.min() == 255
+
+
+def test_moves_are_arrows_from_pick_to_place() -> None:
+    moves = np.array([[[5.0, 6], [40, 30]], [[8, 9], [-10, 50]]])
+    figure = plot_moves({"demonstration": (PICTURE, moves), "now": (PICTURE, moves[:1])})
+    first, second = figure.axes
+    assert [axis.get_title() for axis in figure.axes] == ["demonstration", "now"]
+    ends = {(*text.xyann, *text.xy) for text in first.texts}
+    assert ends == {(5, 6, 40, 30), (8, 9, -10, 50)} and len(second.texts) == 2  # a dark and a bright one each
+    assert first.get_xlim() == (-0.5, 63.5)
+    with pytest.raises(ValueError, match="pictures must not be empty"):
+        plot_moves({})

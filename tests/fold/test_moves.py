@@ -140,3 +140,25 @@ def test_no_answer_moves_nothing() -> None:
     for chosen in (AGREE, BEST):
         answer = choose_moves(LOOK, empty, chosen, np.asarray, np.asarray)
         assert answer.moves.shape == (0, 2, 2) and answer.motion is None and answer.share == 0
+
+
+def test_of_an_object_bent_otherwise_each_pick_takes_its_nearest_mode() -> None:
+    asked = np.array([[-8.0, 0], [8, 0], [-4, 0], [-2, 0], [2, 0], [4, 0]])
+    bent = np.array([[-2.0, 7], [2, 7], [-4, 3.5], [-2.5, 1], [2.5, 1], [4, 3.5]])
+    look = Look(LOOK.image, np.stack([asked[:2], [[-1.0, 0], [1, 0]]], 1), asked[2:])
+    turned = bent[[1, 0, 5, 4, 3, 2]]
+    answer = choose_moves(look, make_match(np.stack([bent, turned], 1)), AGREE, np.asarray, np.asarray)
+    assert 0 < answer.share < 0.7
+    assert sorted(answer.moves[:, 0].tolist()) == [[-2, 7], [2, 7]]
+    np.testing.assert_allclose(answer.moves[:, 1], answer.motion.apply(look.moves[:, 1]))
+
+
+def test_the_command_draws_the_moves_and_replaces_no_image(data, written, capsys, tmp_path) -> None:
+    image = SAMPLE / data.labels.file[NOW]
+    out = tmp_path / "moves.png"
+    main(["fold", str(written), str(image), "--weights", "cloth", "--out", str(out)])
+    assert out.read_bytes().startswith(b"\x89PNG") and capsys.readouterr().out.startswith("pick ")
+    copy = tmp_path / "now.png"
+    copy.write_bytes(out.read_bytes())
+    said = fail(capsys, str(written), str(copy), "--weights", "cloth", "--out", str(copy))
+    assert "--out must not be the image itself" in said and copy.read_bytes() == out.read_bytes()
