@@ -92,14 +92,17 @@ def _read_pixels(where: str, key: str, values: Any, shape: tuple[int, ...]) -> n
     return pixels
 
 
-def write_demonstration(demonstration: Demonstration, path: Path) -> Path:
-    """Write a demonstration to ``path`` (.json), its images beside it; returns the path."""
+def write_demonstration(demonstration: Demonstration, path: Path, *, quality: int | None = None) -> Path:
+    """Write a demonstration to ``path`` (.json), its images beside it; returns the path.
+
+    ``quality`` of the images is as `mmgsd.images.encode_image` has it; none: lossless.
+    """
     path = Path(path)
     check("path", path, "a file whose name ends with .json", path.suffix == ".json")
     looks = []
     for number, look in enumerate(demonstration.looks):
         image = path.with_name(f"{path.stem}_{number}.webp")
-        write_bytes(image, encode_image(look.image))
+        write_bytes(image, encode_image(look.image, quality=quality))
         pixels = {name: getattr(look, name).round(2).tolist() for name in ("moves", "anchors")}
         looks.append({"image": image.name, **pixels})
     return write_json(path, {"object": demonstration.object, "looks": looks}, indent=None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -73,3 +74,15 @@ def estimate_mean(values: np.ndarray, *, seed: int = 0) -> dict[str, float | int
     low, high = np.quantile(drawn, [0.025, 0.975])
     numbers = {"mean": values.mean(), "low": low, "high": high}
     return {name: round(float(value), 5) for name, value in numbers.items()} | {"count": len(values)}
+
+
+def compare_rollouts(
+    rows: Mapping[str, Sequence[float]], others: Mapping[str, Sequence[float]], among: Collection[str]
+) -> dict[str, dict[str, float | int | None]]:
+    """How much more error and success ``others`` have than ``rows``, paired by rollout: `estimate_mean` of each.
+
+    Both hold (error, success) by a rollout's name; those count that both hold and that are ``among`` these names.
+    """
+    shared = [name for name in rows if name in others and name in among]
+    return {key: estimate_mean([float(others[name][k]) - float(rows[name][k]) for name in shared])
+            for k, key in enumerate(("error", "success"))}  # fmt: skip

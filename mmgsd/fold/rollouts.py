@@ -2,6 +2,7 @@
 
     python -m mmgsd.fold.rollouts quick         -> data/results/quick/folding.json, figures/quick/folding.jpg
     python -m mmgsd.fold.rollouts quick --only mmgsd       those policies whose name holds that text
+    python -m mmgsd.fold.rollouts demonstrations           -> data/demonstrations, what policies are shown
 
 All go in step: first states, every policy's answers, what physics makes of them, the next look. A killed run goes on.
 """
@@ -25,8 +26,8 @@ from mmgsd.figures.folding import plot_rollouts
 from mmgsd.figures.style import save_figure
 from mmgsd.files import DamagedFileError, read_json, set_aside, write_json
 from mmgsd.fold.agreement import Motion
-from mmgsd.fold.demonstration import Demonstration, Look
-from mmgsd.fold.measures import SIDES_M, SUCCESS, estimate_mean, measure_outcome
+from mmgsd.fold.demonstration import Demonstration, Look, write_demonstration
+from mmgsd.fold.measures import SIDES_M, SUCCESS, compare_rollouts, estimate_mean, measure_outcome
 from mmgsd.fold.moves import Answer, choose_moves
 from mmgsd.fold.policies import POLICIES, Policy, ask, digest_policy, draw_moves
 from mmgsd.fold.tasks import GROUNDS, TASKS, Task
@@ -37,7 +38,10 @@ from mmgsd.scene.folding import act_job, demonstration_job, run_jobs, start_job,
 from mmgsd.scene.state import State, read_state
 from mmgsd.symmetry import load_group
 
-ROLLOUTS = {"smoke": 2, "quick": 10, "paper": 100}  # of each policy and object
+ROLLOUTS = {"smoke": 2, "quick": 36, "paper": 100}  # of each policy and object
+DEMONSTRATIONS = "demonstrations"  # instead of a preset: write these alone
+REFERENCE = "mmgsd"  # the policy that the others are compared with, rollout by rollout
+QUALITY = 90  # of the images of demonstrations as files
 AGREES = 0.7  # share of the questions that agree from which a cautious robot acts
 ANCHORS = {"cloth": [25 * r + c for r in (1, 12, 23) for c in (1, 12, 23) if (r, c) != (12, 12)],
            "rope": [8, 120, 200, 424, 504, 616]}  # fmt: skip  # material points that a demonstration marks besides
@@ -86,14 +90,31 @@ def run_folding(
         kept = [rollout for rollout in rollouts if not read_state(starts[rollout]).about["fault"]]
         found = bench.roll(policies, kept, starts)
         pictures |= bench.list_pictures(policies, kept, starts)
-        reachable = {key for key, row in found.get("truth", {}).items() if row["success"]}
+        reachable = {key for key, row in found.get("truth", {}).items() if row["success"]} - bench.list_done(starts)
         for policy in policies:
             rows[object][policy.name] = summarise_rollouts(found[policy.name], reachable)
         rows[object] = {name: rows[object][name] for name in POLICIES if name in rows[object]}
+        if REFERENCE in rows[object]:
+            ours = rows[object][REFERENCE]["rollouts"]
+            for row in rows[object].values():
+                row["beyond"] = compare_rollouts(ours, row["rollouts"], reachable)
     run = {"rollouts": ROLLOUTS[preset], "hardware": name_hardware(torch.device("cpu")),
            "minutes": round((time.monotonic() - began) / 60, 1)}  # fmt: skip
     save_figure(plot_rollouts(pictures), paths.figures / "folding", kinds=("jpg",))
     return write_json(out, {"run": run, "policies": rows})
+
+
+def write_demonstrations(root: Path, *, workers: int = 0, scheduler: str = "", progress: bool = True) -> list[Path]:
+    """Write what policies are shown of each task as files of the format that a user's demonstrations have; their paths.
+
+    To ``data/demonstrations``, by name of the task. ``workers`` and ``scheduler`` are as `run_jobs` has them.
+    """
+    how = {"workers": workers, "scheduler": scheduler, "progress": progress}
+    bench = Bench(Paths(root, "quick").generated / "folding", how)
+    bench.demonstrate(TASKS.values())
+    folder = root / "data" / "demonstrations"
+    return [write_demonstration(bench.make_demonstration(task), folder / f"{task.name}.json", quality=QUALITY)
+            for task in TASKS.values()]  # fmt: skip
 
 
 class Bench:
@@ -106,11 +127,15 @@ class Bench:
 
     def make_starts(self, rollouts: list[Rollout]) -> dict[Rollout, Path]:
         """First states, and before them the states that the rollouts' demonstrations go through."""
-        for task in {rollout.task: TASKS[rollout.task] for rollout in rollouts}.values():
-            self.demonstrated.setdefault(task.name, self._demonstrate(task))
+        self.demonstrate({rollout.task: TASKS[rollout.task] for rollout in rollouts}.values())
         jobs = {r.name: start_job(TASKS[r.task], r.start, r.ground, r.seed) for r in rollouts}
         files = run_jobs(jobs, self.folder / "starts", **self.how)
         return {rollout: files[rollout.name] for rollout in rollouts}
+
+    def demonstrate(self, tasks: Iterable[Task]) -> None:
+        """The states that tasks' demonstrations go through."""
+        for task in tasks:
+            self.demonstrated.setdefault(task.name, self._demonstrate(task))
 
     def _demonstrate(self, task: Task) -> list[State]:
         """The states before, between and after a task's looks, each look by its own places."""
@@ -130,6 +155,10 @@ class Bench:
             anchors = [k for k in ANCHORS[task.object] if state.visible[k] and k not in [move.pick for move in moves]]
             looks.append(Look(state.image, pixels.reshape(-1, 2, 2), state.xy[anchors].astype(float)))
         return Demonstration(task.object, tuple(looks))
+
+    def list_done(self, starts: Mapping[Rollout, Path]) -> set[str]:
+        """Names of the rollouts whose first state is a success already: who does nothing must not be praised."""
+        return {rollout.name for rollout, file in starts.items() if self._judge(rollout, file, [])["success"]}
 
     def roll(
         self, policies: list[Policy], rollouts: list[Rollout], starts: dict[Rollout, Path]
@@ -203,7 +232,7 @@ class Bench:
         failed = bool(state.about["fault"])
         return {"task": task.name, "error": outcome.error_m / side, "overlap": outcome.overlap,
                 "success": not failed and outcome.error_m < SUCCESS * side, "fault": state.about["fault"],
-                "share": min(answer.share for answer in answers)}  # fmt: skip
+                "share": min([1.0, *(answer.share for answer in answers)])}  # fmt: skip
 
 
 def find_on_table(xy: np.ndarray, state: State) -> np.ndarray:
@@ -216,8 +245,9 @@ def find_on_table(xy: np.ndarray, state: State) -> np.ndarray:
 def summarise_rollouts(rows: dict[str, dict[str, Any]], reachable: set[str]) -> dict[str, Any]:
     """Errors (share of the side), overlap and success of all rollouts, of those ``reachable``, by task; caution.
 
-    ``reachable`` are the rollouts that the true matches succeed in: the others say something of the bench. "cautious":
-    success of those where at least `AGREES` of the questions agree, and how many these are.
+    ``reachable`` are the rollouts that the true matches succeed in, and that are no success before anything is done:
+    the others say something of the bench. "cautious": success of those where at least `AGREES` of the questions agree,
+    and how many these are.
     """
     groups = {"all": list(rows.values()), "reachable": [row for name, row in rows.items() if name in reachable]}
     groups |= {task: [row for row in rows.values() if row["task"] == task] for task in TASKS}
@@ -249,13 +279,19 @@ def _to_list(motion: Motion) -> list[list[float]]:
 
 
 def main() -> None:
-    """Run the bench of a preset."""
+    """Run the bench of a preset, or write the demonstrations."""
     parser = argparse.ArgumentParser(prog="python -m mmgsd.fold.rollouts", description=__doc__.split("\n")[0])
-    parser.add_argument("preset", choices=tuple(ROLLOUTS))
+    parser.add_argument("preset", choices=(*ROLLOUTS, DEMONSTRATIONS))
     parser.add_argument("--only", default="", help="policies whose name holds this text; their rows alone are written")
     parser.add_argument("--workers", type=int, default=0, help="child processes at once (default: one a core)")
     parser.add_argument("--scheduler", default="", help="address of a Dask scheduler; none: this machine")
     args = parser.parse_args()
+    if args.preset == DEMONSTRATIONS:
+        if args.only:
+            parser.error(f"--only {args.only!r} must be given with a preset, got {DEMONSTRATIONS}")
+        how = {"workers": args.workers, "scheduler": args.scheduler}
+        print("\n".join(map(str, write_demonstrations(find_root(), **how))))
+        return
     policies = [policy for policy in POLICIES.values() if args.only in policy.name or policy.name == "truth"]
     if not any(args.only in policy.name for policy in policies):
         parser.error(f"--only {args.only!r}: no policy has a name with that; there are {', '.join(POLICIES)}")

@@ -9,13 +9,15 @@ from mmgsd.config import OBJECTS
 from mmgsd.fold.policies import POLICIES
 
 Results = Mapping[str, Any]  # data/results/<preset>/folding.json
-HEADS = ("success", "error", "overlap")
+HEADS = ("success", "error", "overlap", "error of all")
+COMPARED = {"mmgsd_best": "each pixel's surest mode", "spcl": "SPCL"}  # with MMGSD's agreeing modes
 
 
 def make_folding_table(results: Results) -> str:
-    """Markdown, a row a policy: success, error and overlap of the rollouts that the true matches succeed in.
+    """Markdown, a row a policy: success, error and overlap of the rollouts that count, and the error of all.
 
-    With 95 % intervals of the success; what was not measured is a dash.
+    Those count that the true matches succeed in, and that are no success before anything is done. With 95 % intervals
+    of the success; what was not measured is a dash.
     """
     heads = ["", *(f"{name}: {head}" if head == HEADS[0] else head for name in OBJECTS for head in HEADS)]
     lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
@@ -29,22 +31,32 @@ def make_folding_table(results: Results) -> str:
 
 
 def make_folding_sentence(results: Results) -> str:
-    """How many rollouts there were and how many of them the true matches succeed in; what caution brings."""
-    said, rows = [], results["policies"]
-    for object in OBJECTS:
-        reachable = rows[object]["truth"].get("reachable", rows[object]["truth"]["all"])["success"]["count"]
-        sure = rows[object].get("mmgsd", {}).get("cautious", {"count": 0})
-        caution = f", and MMGSD {100 * sure['mean']:.0f} % of the {sure['count']} it agrees on" if sure["count"] else ""
-        count = rows[object]["truth"]["all"]["success"]["count"]
-        said.append(f"{object}: the true matches succeed in {reachable} of {count}{caution}")
+    """How many rollouts count, what caution brings, and how much farther off than MMGSD others end."""
+    said = [f"{object.capitalize()}: {_say_object(results['policies'][object])}" for object in OBJECTS]
     run = results["run"]
-    return f"Rollouts: {'; '.join(said)} ({run['minutes']:g} minutes, {run['hardware']})."
+    return f"{'. '.join(said)}. It took {run['minutes']:g} minutes ({run['hardware']})."
+
+
+def _say_object(rows: Mapping[str, Any]) -> str:
+    truth = rows["truth"]
+    counted = truth["reachable"]["success"]["count"] if "reachable" in truth else 0
+    parts = [f"{counted} of {truth['all']['success']['count']} rollouts count"]
+    sure = rows.get("mmgsd", {}).get("cautious", {"count": 0})
+    if sure["count"]:
+        parts.append(f"MMGSD succeeds in {100 * sure['mean']:.0f} % of the {sure['count']} whose modes agree most")
+    for name, label in COMPARED.items():
+        more = rows.get(name, {}).get("beyond", {"error": {"count": 0}})["error"]
+        if more["count"]:
+            mean, low, high = (f"{100 * more[key]:.1f}" for key in ("mean", "low", "high"))
+            parts.append(f"{label} ends {mean} points ({low} to {high}) farther off than MMGSD")
+    return "; ".join(parts)
 
 
 def _list_cells(row: Mapping[str, Any] | None) -> list[str]:
-    found = (row or {}).get("reachable")
-    if not found:
+    if not row or "reachable" not in row:
         return ["–"] * len(HEADS)
+    found = row["reachable"]
     success = found["success"]
     interval = f"{100 * success['mean']:.0f} % ({100 * success['low']:.0f} to {100 * success['high']:.0f})"
-    return [interval, *(f"{100 * found[key]['mean']:.1f} %" for key in HEADS[1:])]
+    means = (found["error"], found["overlap"], row["all"]["error"])
+    return [interval, *(f"{100 * value['mean']:.1f} %" for value in means)]

@@ -92,9 +92,9 @@ def run_jobs(
 ) -> dict[str, Path]:
     """Make each job's state, the file ``folder/<name>.npz``; returns the files by name.
 
-    Whole ones that are there already are kept; damaged ones, and those of another job, are set aside and made again. An
-    act's state must be there. ``workers`` child processes at once (0: one a core), or the ``scheduler`` of an existing
-    Dask cluster by its address. RenderError where a child process fails.
+    Whole ones that are there already are kept; damaged ones are set aside, those of another job replaced. An act's
+    state must be there. ``workers`` child processes at once (0: one a core), or the ``scheduler`` of an existing Dask
+    cluster by its address. RenderError where a child process fails.
     """
     folder, workers, progress = Path(folder), read_count("workers", workers), read_flag("progress", progress)
     files = {name: folder / f"{name}.npz" for name in jobs}
@@ -106,16 +106,14 @@ def run_jobs(
 
 
 def _is_whole(path: Path, job: dict) -> bool:
-    """Whether a job's state is there; a damaged one, or another job's, is set aside."""
+    """Whether a job's state is there; a damaged one is set aside, another job's will be replaced."""
     if not path.is_file():
         return False
     try:
-        whole = read_state(path).about["mark"] == job["mark"]
+        return read_state(path).about["mark"] == job["mark"]
     except DamagedFileError:
-        whole = False
-    if not whole:
         set_aside(path)
-    return whole
+        return False
 
 
 def _run_missing(client: Client, jobs: dict[str, dict], files: dict[str, Path], progress: bool) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mmgsd.fold.measures import estimate_mean, measure_outcome, measure_overlap
+from mmgsd.fold.measures import compare_rollouts, estimate_mean, measure_outcome, measure_overlap
 from mmgsd.symmetry import grid_group, line_group
 
 ROW, COLUMN = np.divmod(np.arange(625), 25)
@@ -57,3 +57,12 @@ def test_intervals_hold_the_mean_and_shrink_with_more(rng: np.random.Generator) 
         few["low"] < few["mean"] < few["high"] and many["high"] - many["low"] < 0.2 * (few["high"] - few["low"]) + 0.1
     )
     assert estimate_mean(np.zeros(0)) == {"mean": None, "low": None, "high": None, "count": 0}
+
+
+def test_a_comparison_is_of_the_same_rollouts() -> None:
+    ours = {"a": (0.01, True), "b": (0.02, True), "c": (0.03, True), "d": (0.5, False)}
+    others = {"a": (0.21, False), "b": (0.02, True), "d": (0.9, False), "e": (0.9, False)}
+    found = compare_rollouts(ours, others, {"a", "b", "c", "e"})
+    assert found["error"]["mean"] == pytest.approx(0.1) and found["error"]["count"] == 2
+    assert found["success"]["mean"] == -0.5
+    assert found["error"]["low"] == 0 and found["error"]["high"] == pytest.approx(0.2)

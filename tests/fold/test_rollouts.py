@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from mmgsd.fold import rollouts
+from mmgsd.fold.demonstration import read_demonstration
 from mmgsd.fold.policies import POLICIES
 from mmgsd.fold.rollouts import find_on_table, list_rollouts, run_folding, summarise_rollouts
 from mmgsd.fold.tasks import GROUNDS, TASKS
@@ -88,6 +89,21 @@ def test_an_interrupted_run_goes_on_from_its_files(tmp_path: Path, physics: list
     with pytest.warns(UserWarning, match="damaged"):
         run_folding("smoke", tmp_path, policies=ASKED, progress=False)
     assert all(path.read_bytes() == content for path, content in kept.items())
+
+
+def test_a_rollout_that_is_a_success_untouched_does_not_count(tmp_path: Path, physics: list[str]) -> None:
+    results = json.loads(run_folding("smoke", tmp_path, policies=ASKED, progress=False).read_text())
+    rows = results["policies"]["cloth"]  # nothing moves, and the demonstration's end is its start
+    assert rows["truth"]["all"]["success"]["mean"] == 1 and "reachable" not in rows["truth"]
+
+
+def test_demonstrations_are_written_as_a_users_are_read(tmp_path: Path, physics: list[str]) -> None:
+    paths = rollouts.write_demonstrations(tmp_path, progress=False)
+    assert [path.stem for path in paths] == list(TASKS)
+    for path in paths:
+        read, task = read_demonstration(path), TASKS[path.stem]
+        assert read.object == task.object and [len(look.moves) for look in read.looks] == list(map(len, task.looks))
+        assert len(read.looks[0].asked) > len(task.looks[0])
 
 
 def test_rows_of_other_policies_stay(tmp_path: Path, physics: list[str]) -> None:

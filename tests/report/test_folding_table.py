@@ -11,7 +11,9 @@ def mean(value: float, count: int = 8) -> dict[str, float | int]:
 
 def row(success: float) -> dict:
     part = {"success": mean(success), "error": mean(0.0312), "overlap": mean(0.874)}
-    return {"all": {**part, "success": mean(success, 10)}, "reachable": part, "cautious": mean(0.9, 5)}
+    beyond = {"error": mean(0.2), "success": mean(-0.5)}
+    every = {**part, "success": mean(success, 10), "error": mean(0.0712, 10)}
+    return {"all": every, "reachable": part, "cautious": mean(0.9, 5), "beyond": beyond}
 
 
 RESULTS = {
@@ -22,14 +24,25 @@ RESULTS = {
 
 def test_a_row_a_policy_with_the_interval_of_its_success() -> None:
     lines = make_folding_table(RESULTS).splitlines()
-    assert lines[0] == "|  | cloth: success | error | overlap | rope: success | error | overlap |"
-    assert lines[2].startswith("| true matches | 80 % (70 to 90) | 3.1 % | 87.4 % | 80 %")
-    assert lines[3] == "| MMGSD, modes that agree | 75 % (65 to 85) | 3.1 % | 87.4 % | – | – | – |"
+    heads = "success | error | overlap | error of all"
+    assert lines[0] == f"|  | cloth: {heads} | rope: {heads} |"
+    assert lines[2].startswith("| true matches | 80 % (70 to 90) | 3.1 % | 87.4 % | 7.1 % | 80 %")
+    assert lines[3] == "| MMGSD, modes that agree | 75 % (65 to 85) | 3.1 % | 87.4 % | 7.1 % | – | – | – | – |"
     assert len(lines) == 4
 
 
-def test_counts_and_caution_are_said() -> None:
-    assert make_folding_sentence(RESULTS) == (
-        "Rollouts: cloth: the true matches succeed in 8 of 10, and MMGSD 90 % of the 5 it agrees on; "
-        "rope: the true matches succeed in 8 of 10 (12.5 minutes, CPU, 2 cores)."
+def test_counts_caution_and_pairs_are_said() -> None:
+    results = {**RESULTS, "policies": {**RESULTS["policies"]}}
+    results["policies"]["cloth"] = {**results["policies"]["cloth"], "spcl": row(0.5)}
+    assert make_folding_sentence(results) == (
+        "Cloth: 8 of 10 rollouts count; MMGSD succeeds in 90 % of the 5 whose modes agree most; SPCL ends 20.0 points "
+        "(10.0 to 30.0) farther off than MMGSD. Rope: 8 of 10 rollouts count. It took 12.5 minutes (CPU, 2 cores)."
     )
+
+
+def test_rollouts_of_which_none_counts_are_dashes() -> None:
+    part = RESULTS["policies"]["cloth"]["truth"]["all"]
+    rows = {"truth": {"all": part, "cautious": {"count": 0}, "beyond": {}}}
+    results = {"run": RESULTS["run"], "policies": {"cloth": rows, "rope": rows}}
+    assert make_folding_table(results).splitlines()[2] == f"| true matches |{' – |' * 8}"
+    assert "0 of 10 rollouts count" in make_folding_sentence(results)
