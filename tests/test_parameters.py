@@ -95,8 +95,8 @@ FLAGS = {
     "01_render_data": ("run", "overwrite", "only_test"), "02_inspect_data": ("run",), "03_train": ("run", "overwrite"),
     "04_evaluate": ("run", "overwrite"), "05_sigma_ablation": ("run", "overwrite"),
     "06_uncertainty": ("run", "overwrite"), "07_figures": ("run",), "08_symmetry_study": ("run", "overwrite"),
-    "09_error_analysis": ("run",), "11_broken_symmetry": ("run", "overwrite"), "run_all": ("overwrite",),
-    "your_object": ("overwrite",),
+    "09_error_analysis": ("run",), "10_fold_by_demonstration": ("run",), "11_broken_symmetry": ("run", "overwrite"),
+    "run_all": ("overwrite",), "your_object": ("overwrite",),
 }  # fmt: skip
 WRONG = [  # notebook, parameter, what it was given, what the error says besides the parameter's name
     *((path.stem, "preset", value, PRESETS) for path in CHECKED for value in ("papr", 3, None, ["quick"])
@@ -143,6 +143,9 @@ WRONG = [  # notebook, parameter, what it was given, what the error says besides
     ("08_symmetry_study", "groups", [], "from 1 on"),
     ("08_symmetry_study", "groups", ["c5"], "'v4', 'c4', 'd4'"),
     ("08_symmetry_study", "groups", "c4 own", "got 'own'"),
+    ("10_fold_by_demonstration", "task", "fold", "'edge'"),
+    ("10_fold_by_demonstration", "task", "ends", "'edge'"),
+    ("10_fold_by_demonstration", "target", 8, "from 0 to 7, got 8"),
     ("11_broken_symmetry", "images", "quik", 'did you mean \'quick\'?), got \'quik\'; or "" for none'),
     ("11_broken_symmetry", "images", 1, PRESETS),
     ("09_error_analysis", "method", "mmgsdd", "did you mean 'mmgsd'?"),
@@ -260,6 +263,7 @@ MISSING = [  # notebook, what it is told, what it asks for
     ("08_symmetry_study", {}, STORED + "symmetry.json yet: run 08_symmetry_study with run=True for it first"),
     ("09_error_analysis", {**SMOKE, "objects": "rope"}, "smoke/rope/dataset.json yet"),
     ("09_error_analysis", {"method": "spcl"}, STORED + "errors_spcl.json yet: run 09_error_analysis with run=True"),
+    ("10_fold_by_demonstration", {}, STORED + "folding.json yet: run 10_fold_by_demonstration with run=True for it"),
     ("11_broken_symmetry", {}, STORED + "broken_symmetry.json yet: run 11_broken_symmetry with run=True for it first"),
 ]
 

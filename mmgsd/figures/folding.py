@@ -23,7 +23,7 @@ def plot_moves(pictures: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
     """
     check_filled("pictures", pictures)
     aspects = [max(image.shape[0] / image.shape[1] for image, _ in pictures.values())]
-    figure, axes = make_grid(aspects, len(pictures), PANEL_IN * len(pictures))
+    figure, axes = make_grid(aspects, len(pictures), min(PAGE_IN, PANEL_IN * len(pictures)))
     for axis, (title, (image, moves)) in zip(axes[0], pictures.items(), strict=True):
         axis.imshow(image)
         axis.autoscale(False)  # a place may lie outside

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mmgsd.checks import check_choice
 from mmgsd.fold.agreement import (
     RADIUS,
     Motion,
@@ -73,12 +74,15 @@ def choose_moves(
     return Answer(np.stack([np.where(near[:, None], grasped, wanted), motion.apply(places)], 1), motion, share)
 
 
-def answer_picture(matcher: Matcher, demonstration: Demonstration, image: np.ndarray, *, look: int = 0) -> Answer:
+def answer_picture(
+    matcher: Matcher, demonstration: Demonstration, image: np.ndarray, *, look: int = 0, chosen: str = AGREE
+) -> Answer:
     """Moves (M, 2, 2) px in a picture (H, W, 3) uint8 of the present state, as one look of a demonstration made them.
 
     The picture is taken from about where the demonstration's was: a turn, a shift and a scale lead from one to the
-    other. ValueError for a look that there is not, weights of another object, a picture that does not show the object,
-    a pick off the object, and where fewer than `LEAST` of the look's picks and anchors agree.
+    other; ``chosen`` is as `choose_moves` has it. ValueError for a look that there is not, weights of another object, a
+    picture that does not show the object, a pick off the object, and where fewer than `LEAST` of the look's picks and
+    anchors agree.
     """
     count = len(demonstration.looks)
     if look not in range(count):
@@ -86,6 +90,7 @@ def answer_picture(matcher: Matcher, demonstration: Demonstration, image: np.nda
     if matcher.object and matcher.object != demonstration.object:
         raise ValueError(f"weights must be of the demonstration's object {demonstration.object!r}, got weights of "
                          f"{matcher.object!r}")  # fmt: skip
+    check_choice("chosen", chosen, (AGREE, BEST))
     shown = demonstration.looks[look]
     match = matcher.match(shown.image, image, shown.asked)
     if match.on_object is not None and (match.on_object < 0.5).any():
@@ -93,7 +98,7 @@ def answer_picture(matcher: Matcher, demonstration: Demonstration, image: np.nda
         raise ValueError(f"picks and anchors must be on the object of the demonstration, these are not: {off}")
     if match.absent is not None and match.absent[0] > 0.5:
         raise ValueError(f"the picture must show a {demonstration.object}, none is seen in it")
-    answer = choose_moves(shown, match, AGREE, np.asarray, np.asarray, free_scale=True)
+    answer = choose_moves(shown, match, chosen, np.asarray, np.asarray, free_scale=True)
     if answer.share < LEAST:
         raise ValueError(f"the picture's answers must agree with the demonstration, {answer.share:.0%} of them do: "
                          "take it from where the demonstration was taken, or add anchors")  # fmt: skip

@@ -53,6 +53,15 @@ def test_two_corners_of_one_edge_are_found_again(data, demonstration) -> None:
     assert length.min() > 0.7 * np.linalg.norm(answer.moves[1, 0] - answer.moves[0, 0])
 
 
+def test_the_surest_modes_of_a_picture_are_those_of_each_pixel(data, demonstration) -> None:
+    matcher, image, look = mmgsd.load("cloth"), data.load_image(NOW), demonstration.looks[0]
+    answer = answer_picture(matcher, demonstration, image, chosen=BEST)
+    surest = matcher.match(look.image, image, look.asked).best().xy[: len(look.moves)]
+    np.testing.assert_allclose(answer.moves[:, 0], surest)
+    with pytest.raises(ValueError, match="chosen must be one of 'agree', 'best', got 'first'"):
+        answer_picture(matcher, demonstration, image, chosen="first")
+
+
 def test_the_command_prints_pixels_and_rays(data, written, capsys) -> None:
     image = str(SAMPLE / data.labels.file[NOW])
     main(["fold", str(written), image, "--weights", "cloth", "--json", "--intrinsics", "900,900,242,242"])
