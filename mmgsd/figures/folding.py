@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 
-from mmgsd.figures.style import MARK, PAGE_IN, check_filled, finish_axes, make_grid, mark_pixel, styled
+from mmgsd.figures.style import MARK, PAGE_IN, check_filled, make_grid, mark_pixel, styled
 
 THUMBNAIL_PX = 160  # sides of a picture
 PANEL_IN = 2.4  # width of a picture with moves
@@ -32,7 +32,7 @@ def plot_moves(pictures: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
                 axis.annotate("", place, pick, arrowprops={"arrowstyle": "->", "color": colour, "lw": width})
             mark_pixel(axis, *pick)
         axis.set_title(title)
-    return finish_axes(figure)
+    return figure
 
 
 @styled

@@ -44,9 +44,10 @@ def relax(points: np.ndarray, tension: np.ndarray, ball_radius: float) -> np.nda
 
 
 def _normals(points: np.ndarray, stride: int) -> np.ndarray:
-    """Unit normals in the plane (N - 2 stride, 2), left of the chord between neighbours ``stride`` away."""
+    """Unit normals in the plane (N - 2 stride, 2), left of the chord between neighbours ``stride`` away; 0 of none."""
     chord = points[2 * stride :, :2] - points[: -2 * stride, :2]
-    return np.stack([-chord[:, 1], chord[:, 0]], axis=1) / np.linalg.norm(chord, axis=1, keepdims=True)
+    length = np.linalg.norm(chord, axis=1, keepdims=True)
+    return np.stack([-chord[:, 1], chord[:, 0]], axis=1) / np.maximum(length, 1e-9)
 
 
 def _residual(points: np.ndarray, rest: np.ndarray | float, stride: int) -> np.ndarray:

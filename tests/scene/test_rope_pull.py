@@ -5,6 +5,7 @@ import pytest
 
 from mmgsd.fold.tasks import TASKS
 from mmgsd.scene.rope_pull import pull_rope
+from mmgsd.scene.rope_relax import bend
 from mmgsd.scene.rope_shape import LENGTH, sample_rope
 
 
@@ -46,3 +47,9 @@ def test_without_grasps_a_rope_stays_nearly_as_it_lies():
 def test_a_point_that_the_rope_has_not_is_refused():
     with pytest.raises(ValueError, match="grasps must have indices from 0 to 624, got 625"):
         pull_rope(np.zeros((625, 3)), 0.04, [(625, np.zeros(2))])
+
+
+def test_a_particle_whose_neighbours_are_at_one_place_stays_finite():
+    points = np.array([[0.0, 0, 0.5], [0.5, 0, 0.5], [0.0, 0, 0.5], [0.5, 0, 0.5], [1.0, 0, 0.5]])  # grippers met
+    bend(points, 0.0, 1)
+    assert np.isfinite(points).all()
