@@ -10,14 +10,12 @@ All go in step: first states, every policy's answers, what physics makes of them
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from mmgsd.checks import check_choice
 from mmgsd.command import run_command
@@ -31,7 +29,6 @@ from mmgsd.fold.measures import SIDES_M, SUCCESS, compare_rollouts, estimate_mea
 from mmgsd.fold.moves import Answer, choose_moves
 from mmgsd.fold.policies import POLICIES, Policy, ask, digest_policy, draw_moves
 from mmgsd.fold.tasks import GROUNDS, TASKS, Task
-from mmgsd.learn.training import name_hardware
 from mmgsd.match.camera import compute_rays
 from mmgsd.progress import ProgressBar
 from mmgsd.scene.folding import act_job, demonstration_job, run_jobs, start_job, true_moves
@@ -79,7 +76,7 @@ def run_folding(
     Rows of other policies that the results hold stay. ValueError for a preset without rollouts.
     """
     check_choice("preset", preset, tuple(ROLLOUTS))
-    began, paths = time.monotonic(), Paths(root, preset)
+    paths = Paths(root, preset)
     bench = Bench(paths.generated / "folding", {"workers": workers, "scheduler": scheduler, "progress": progress})
     out = paths.results / "folding.json"
     rows = read_json(out)["policies"] if out.is_file() else {name: {} for name in OBJECTS}
@@ -98,10 +95,8 @@ def run_folding(
             ours = rows[object][REFERENCE]["rollouts"]
             for row in rows[object].values():
                 row["beyond"] = compare_rollouts(ours, row["rollouts"], reachable)
-    run = {"rollouts": ROLLOUTS[preset], "hardware": name_hardware(torch.device("cpu")),
-           "minutes": round((time.monotonic() - began) / 60, 1)}  # fmt: skip
     save_figure(plot_rollouts(pictures), paths.figures / "folding", kinds=("jpg",))
-    return write_json(out, {"run": run, "policies": rows})
+    return write_json(out, {"run": {"rollouts": ROLLOUTS[preset]}, "policies": rows})
 
 
 def write_demonstrations(root: Path, *, workers: int = 0, scheduler: str = "", progress: bool = True) -> list[Path]:

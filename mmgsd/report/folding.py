@@ -33,8 +33,7 @@ def make_folding_table(results: Results) -> str:
 def make_folding_sentence(results: Results) -> str:
     """How many rollouts count, what caution brings, and how much farther off than MMGSD others end."""
     said = [f"{object.capitalize()}: {_say_object(results['policies'][object])}" for object in OBJECTS]
-    run = results["run"]
-    return f"{'. '.join(said)}. It took {run['minutes']:g} minutes ({run['hardware']})."
+    return f"{'. '.join(said)}."
 
 
 def _say_object(rows: Mapping[str, Any]) -> str:

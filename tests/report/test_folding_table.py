@@ -17,7 +17,7 @@ def row(success: float) -> dict:
 
 
 RESULTS = {
-    "run": {"rollouts": 10, "minutes": 12.5, "hardware": "CPU, 2 cores"},
+    "run": {"rollouts": 10},
     "policies": {"cloth": {"mmgsd": row(0.75), "truth": row(0.8)}, "rope": {"truth": row(0.8)}},
 }
 
@@ -36,7 +36,7 @@ def test_counts_caution_and_pairs_are_said() -> None:
     results["policies"]["cloth"] = {**results["policies"]["cloth"], "spcl": row(0.5)}
     assert make_folding_sentence(results) == (
         "Cloth: 8 of 10 rollouts count; MMGSD succeeds in 90 % of the 5 whose modes agree most; SPCL ends 20.0 points "
-        "(10.0 to 30.0) farther off than MMGSD. Rope: 8 of 10 rollouts count. It took 12.5 minutes (CPU, 2 cores)."
+        "(10.0 to 30.0) farther off than MMGSD. Rope: 8 of 10 rollouts count."
     )
 
 
