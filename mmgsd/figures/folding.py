@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import cv2
 import numpy as np
 from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
+from PIL import Image
 
 from mmgsd.figures.style import MARK, PAGE_IN, check_filled, make_grid, mark_pixel, styled
+from mmgsd.files import writing
 
 THUMBNAIL_PX = 160  # sides of a picture
+SLIDE_PX, SLIDE_MS = 300, 1400  # sides of a slide's pictures, and how long it is shown
 PANEL_IN = 2.4  # width of a picture with moves
 
 
@@ -61,10 +65,31 @@ def plot_rollouts(pictures: Mapping[str, Mapping[str, np.ndarray]]) -> Figure:
     return figure
 
 
-def crop_square(picture: np.ndarray) -> np.ndarray:
-    """The middle square of a picture (H, W, 3), `THUMBNAIL_PX` wide."""
+def mark_moves(picture: np.ndarray, moves: np.ndarray) -> np.ndarray:
+    """A picture (H, W, 3) uint8 with moves (M, 2, 2) px: an arrow from each pick to its place."""
+    drawn = picture.copy()
+    for pick, place in np.rint(np.asarray(moves, float).reshape(-1, 2, 2)).astype(int).tolist():
+        for colour, width in ((0, 0, 0), 7), ((255, 225, 0), 3):  # seen on any ground
+            cv2.arrowedLine(drawn, pick, place, colour, width, cv2.LINE_AA, tipLength=0.08)
+            cv2.circle(drawn, pick, width + 3, colour, -1, cv2.LINE_AA)
+    return drawn
+
+
+def save_slides(slides: Sequence[tuple[np.ndarray, np.ndarray]], path: Path) -> Path:
+    """Write pairs of pictures (H, W, 3) uint8, their middle squares, as an animated WebP without end; its path.
+
+    ValueError where there is no pair.
+    """
+    check_filled("slides", slides)
+    frames = [Image.fromarray(np.hstack([crop_square(one, SLIDE_PX) for one in pair])) for pair in slides]
+    with writing(path) as aside:
+        frames[0].save(aside, "WEBP", save_all=True, append_images=frames[1:], duration=SLIDE_MS, loop=0, quality=80)
+    return path
+
+
+def crop_square(picture: np.ndarray, size_px: int = THUMBNAIL_PX) -> np.ndarray:
+    """The middle square of a picture (H, W, 3), ``size_px`` wide."""
     height, width = picture.shape[:2]
     side = min(height, width)
     top, left = (height - side) // 2, (width - side) // 2
-    return cv2.resize(picture[top : top + side, left : left + side], (THUMBNAIL_PX, THUMBNAIL_PX),
-                      interpolation=cv2.INTER_AREA)  # fmt: skip
+    return cv2.resize(picture[top : top + side, left : left + side], (size_px, size_px), interpolation=cv2.INTER_AREA)

@@ -1,6 +1,6 @@
 """The bench: rollouts of every policy from the same first states, as files, and what came of them.
 
-    python -m mmgsd.fold.rollouts quick         -> data/results/quick/folding.json, figures/quick/folding.jpg
+    python -m mmgsd.fold.rollouts quick         -> data/results/quick/folding.json, figures/quick/folding.jpg, .webp
     python -m mmgsd.fold.rollouts quick --only mmgsd       those policies whose name holds that text
     python -m mmgsd.fold.rollouts demonstrations           -> data/demonstrations, what policies are shown
 
@@ -20,7 +20,7 @@ import numpy as np
 from mmgsd.checks import check_choice
 from mmgsd.command import run_command
 from mmgsd.config import DEFAULT_GROUP, OBJECTS, Paths, find_root
-from mmgsd.figures.folding import plot_rollouts
+from mmgsd.figures.folding import mark_moves, plot_rollouts, save_slides
 from mmgsd.figures.style import save_figure
 from mmgsd.files import DamagedFileError, read_json, set_aside, write_json
 from mmgsd.fold.agreement import Motion
@@ -69,7 +69,7 @@ def run_folding(
     preset: str, root: Path, *, policies: Iterable[Policy] = tuple(POLICIES.values()), workers: int = 0,
     scheduler: str = "", progress: bool = True,
 ) -> Path:  # fmt: skip
-    """Run a preset's rollouts of some policies, write what came of them, and draw one of each task.
+    """Run a preset's rollouts of some policies, write what came of them, and draw one of each task; the results' path.
 
     ``workers`` and ``scheduler`` are as `run_jobs` has them.
 
@@ -80,13 +80,14 @@ def run_folding(
     bench = Bench(paths.generated / "folding", {"workers": workers, "scheduler": scheduler, "progress": progress})
     out = paths.results / "folding.json"
     rows = read_json(out)["policies"] if out.is_file() else {name: {} for name in OBJECTS}
-    policies, pictures = list(policies), {}
+    policies, pictures, slides = list(policies), {}, []
     for object in OBJECTS:
         rollouts = list_rollouts(object, ROLLOUTS[preset])
         starts = bench.make_starts(rollouts)
         kept = [rollout for rollout in rollouts if not read_state(starts[rollout]).about["fault"]]
         found = bench.roll(policies, kept, starts)
         pictures |= bench.list_pictures(policies, kept, starts)
+        slides += [pair for policy in policies if policy.name == REFERENCE for pair in bench.list_slides(policy, kept)]
         reachable = {key for key, row in found.get("truth", {}).items() if row["success"]} - bench.list_done(starts)
         for policy in policies:
             rows[object][policy.name] = summarise_rollouts(found[policy.name], reachable)
@@ -96,6 +97,8 @@ def run_folding(
             for row in rows[object].values():
                 row["beyond"] = compare_rollouts(ours, row["rollouts"], reachable)
     save_figure(plot_rollouts(pictures), paths.figures / "folding", kinds=("jpg",))
+    if slides:
+        save_slides(slides, paths.figures / "folding.webp")
     return write_json(out, {"run": {"rollouts": ROLLOUTS[preset]}, "policies": rows})
 
 
@@ -119,6 +122,7 @@ class Bench:
         self.folder, self.how = Path(folder), dict(how)
         self.demonstrated: dict[str, list[State]] = {}
         self.ends: dict[tuple[Policy, Rollout], Path] = {}
+        self.acted: dict[tuple[Policy, Rollout], list[tuple[Path, Answer]]] = {}  # each look, and what was done then
 
     def make_starts(self, rollouts: list[Rollout]) -> dict[Rollout, Path]:
         """First states, and before them the states that the rollouts' demonstrations go through."""
@@ -165,6 +169,7 @@ class Bench:
             going = [arm for arm in files if len(TASKS[arm[1].task].looks) > number]
             for arm in ProgressBar(going, desc="answer", disable=not self.how["progress"], leave=False):
                 answers[arm].append(self._answer(*arm, number, files[arm], answers[arm]))
+                self.acted.setdefault(arm, []).append((files[arm], answers[arm][-1]))
             names = {arm: f"{arm[0].name}-{arm[1].name}-{number}" for arm in going}
             jobs = {names[arm]: act_job(files[arm], answers[arm][-1].moves.tolist()) for arm in going}
             made = run_jobs(jobs, self.folder / "acts", **self.how)
@@ -191,6 +196,16 @@ class Bench:
             }
             rows[task.label.replace(" ", "\n", 1)] = row | ends
         return rows
+
+    def list_slides(self, policy: Policy, rollouts: list[Rollout]) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Of a rollout of each task, look by look and at its end: the demonstration's picture and the policy's."""
+        first, slides = {rollout.task: rollout for rollout in reversed(rollouts)}, []
+        for task in (task for task in TASKS.values() if task.name in first):
+            shown, arm = self.demonstrated[task.name], (policy, first[task.name])
+            for look, (file, answer) in zip(self.make_demonstration(task).looks, self.acted[arm], strict=True):
+                slides.append((mark_moves(look.image, look.moves), mark_moves(read_state(file).image, answer.moves)))
+            slides.append((shown[-1].image, read_state(self.ends[arm]).image))
+        return slides
 
     def _answer(self, policy: Policy, rollout: Rollout, number: int, file: Path, before: list[Answer]) -> Answer:
         """The moves (px) of one look, kept as a file; asked anew where the state or the policy is another."""

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+from PIL import Image
 
-from mmgsd.figures.folding import THUMBNAIL_PX, crop_square, plot_moves, plot_rollouts
+from mmgsd.figures.folding import THUMBNAIL_PX, crop_square, mark_moves, plot_moves, plot_rollouts, save_slides
 
 PICTURE = np.zeros((48, 64, 3), np.uint8)
 
@@ -43,3 +46,13 @@ def test_moves_are_arrows_from_pick_to_place() -> None:
     assert first.get_xlim() == (-0.5, 63.5)
     with pytest.raises(ValueError, match="pictures must not be empty"):
         plot_moves({})
+
+
+def test_slides_hold_pairs_with_their_moves(tmp_path: Path) -> None:
+    moved = mark_moves(PICTURE, np.array([[[10.0, 20], [50, 20]]]))
+    assert moved[20, 30].max() > 200 and not PICTURE.any() and not moved[40].any()
+    path = save_slides([(PICTURE, moved), (moved, PICTURE)], tmp_path / "slides.webp")
+    with Image.open(path) as slides:
+        assert slides.n_frames == 2 and slides.width == 2 * slides.height
+    with pytest.raises(ValueError, match="slides must not be empty"):
+        save_slides([], path)

@@ -97,6 +97,13 @@ def test_a_rollout_that_is_a_success_untouched_does_not_count(tmp_path: Path, ph
     assert rows["truth"]["all"]["success"]["mean"] == 1 and "reachable" not in rows["truth"]
 
 
+def test_slides_show_each_look_and_the_end(tmp_path: Path, physics: list[str]) -> None:
+    bench = rollouts.Bench(tmp_path, {"progress": False})
+    kept = [rollout for rollout in list_rollouts("cloth", 8) if rollout.task in ("edge", "twice")]
+    bench.roll(ASKED[:1], kept, bench.make_starts(kept))
+    assert len(bench.list_slides(ASKED[0], kept)) == 2 + 3
+
+
 def test_demonstrations_are_written_as_a_users_are_read(tmp_path: Path, physics: list[str]) -> None:
     paths = rollouts.write_demonstrations(tmp_path, progress=False)
     assert [path.stem for path in paths] == list(TASKS)
