@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from textwrap import fill
 
 import cv2
 import numpy as np
@@ -15,6 +16,7 @@ from mmgsd.figures.style import MARK, PAGE_IN, check_filled, make_grid, mark_pix
 from mmgsd.files import writing
 
 THUMBNAIL_PX = 160  # sides of a picture
+WRAPPED = 13  # letters of a line beside or above such a picture
 SLIDE_PX, SLIDE_MS = 300, 1400  # sides of a slide's pictures, and how long it is shown
 PANEL_IN = 2.4  # width of a picture with moves
 
@@ -58,9 +60,9 @@ def plot_rollouts(pictures: Mapping[str, Mapping[str, np.ndarray]]) -> Figure:
             axis.imshow(crop_square(picture))
             axis.set(xticks=[], yticks=[])
             axis.spines[:].set_visible(False)
-        line[0].set_ylabel(task, fontsize=7)
+        line[0].set_ylabel(fill(task, WRAPPED), fontsize=6)
     for axis, shown in zip(axes[0], columns, strict=True):
-        axis.set_title(shown, fontsize=7)
+        axis.set_title(fill(shown, WRAPPED), fontsize=6)
     plt.close(figure)  # a notebook shows what a cell returns; an open figure would appear twice
     return figure
 

@@ -191,10 +191,7 @@ class Bench:
                 "its end": shown[-1].image,
                 "found": read_state(starts[rollout]).image,
             }
-            ends = {
-                policy.label.replace(", ", ",\n"): read_state(self.ends[policy, rollout]).image for policy in policies
-            }
-            rows[task.label.replace(" ", "\n", 1)] = row | ends
+            rows[task.label] = row | {policy.label: read_state(self.ends[policy, rollout]).image for policy in policies}
         return rows
 
     def list_slides(self, policy: Policy, rollouts: list[Rollout]) -> list[tuple[np.ndarray, np.ndarray]]:
