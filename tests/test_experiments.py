@@ -52,6 +52,8 @@ def list_stored(preset: str) -> dict[str, str]:
     stored = {}
     for file in sorted((ROOT / "data" / "results" / preset).glob("*.json")):
         for first, rows in json.loads(file.read_text()).items():
+            if not isinstance(rows, dict):  # of stages.json, minutes
+                continue
             if "model" in rows:
                 stored["/".join((file.stem, *first.split("-", 1)))] = rows["model"]
             for second, row in rows.items():

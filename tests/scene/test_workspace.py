@@ -106,7 +106,7 @@ def test_things_leave_at_least_half_of_the_object_to_be_seen(monkeypatch: pytest
 
 def test_a_rope_has_no_cords_beside_it() -> None:
     site = grounds.Site(FLAT.points, 1.0, 0.0, np.zeros((1, 2)), (9, 9, 9), 0.01, True)
-    names = {name for seed in range(200) for name, *_ in things._choose(np.random.default_rng(seed), site, True)}
+    names = {name for seed in range(200) for name, *_ in things._choose(np.random.default_rng(seed), site, True, True)}
     assert "cord" not in names and {"mug", "textile", "gripper", "hand"} <= names
 
 
