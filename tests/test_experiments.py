@@ -142,9 +142,9 @@ def test_a_row_differs_from_its_start_in_its_changes_alone() -> None:
 def test_values_may_follow_from_what_a_row_starts_from() -> None:
     models = configure_study(load_preset("quick"), "rope", "main")
     long, fine, deeper = (models[name] for name in ("mmgsd_long", "mmgsd_fine", "mmgsd_fine_deep"))
-    assert (long.steps, fine.steps, fine.input_px, fine.learning_rate) == (675, 168, 192, 0.00075)
+    assert (long.steps, fine.steps, fine.input_px, fine.learning_rate) == (810, 202, 192, 0.00075)
     assert (fine.trunk_weights, deeper.trunk_weights) == (long.name, fine.name)
-    assert (models["mmgsd_muon"].input_px, models["spcl_reference"].steps) == (256, 196)
+    assert (models["mmgsd_muon"].input_px, models["spcl_reference"].steps) == (256, 236)
     assert configure_study(load_preset("smoke"), "cloth", "main")["mmgsd_fine"].steps == 4
     assert ROWS["mmgsd_long"].difference == "steps × 3" and ROWS["±45° only"].difference.endswith("rotation_deg 45.0")
 

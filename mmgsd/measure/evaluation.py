@@ -38,9 +38,8 @@ def evaluate_model(
     The true matches are those of ``group`` ("" is the object's own), whatever the model was taught. As many modes are
     fitted as a query has true matches, but at least ``modes``: of these the most probable ones are the answer.
     ``temperature`` of the heatmaps is the model's own, calibrated one unless given, and so is the ``reading`` of their
-    modes. ValueError for ``modes`` that are
-    not from 0 to `mmgsd.config.MAX_MODES`, for another ``temperature`` than a number above 0, and for weights that
-    were taught another object than the data set shows.
+    modes. ValueError for ``modes`` that are not from 0 to `mmgsd.config.MAX_MODES`, for another ``temperature`` than a
+    number above 0, and for weights that were taught another object than the data set shows.
     """
     overwrite, progress = read_flag("overwrite", overwrite), read_flag("progress", progress)
     modes, out = read_count("modes", modes), Path(out)
@@ -58,7 +57,8 @@ def evaluate_model(
     matcher = Matcher.load(weights)
     if temperature is not None:
         matcher.temperature = temperature
-    matcher.reading = reading or matcher.reading
+    if reading is not None:
+        matcher.reading = reading
     answer = model_answer(matcher, data, config)
     return _answer_all(answer, data, config, group, out, question, progress, modes)
 
