@@ -73,7 +73,7 @@ class Model:
 # In "budget" are the models of "main" with equally many steps, which are then the smaller budget's. With the
 # contrastive papers' margin of 0.5, this network's descriptors collapse before they learn; sharper heatmaps have the
 # least error, held out, with less roundness.
-FOUR = ("main", "budget", "seeds")  # studies of the four methods
+FOUR = ("main", "budget", "seeds")  # studies of the four methods; SPCL with dense supervision is compared by seeds too
 MODELS = (
     Model("mmgsd", "**MMGSD** (ours)", PRESET, {}, ("first", "robustness", *FOUR), "MMGSD", "#D55E00"),
     Model("mmgsd_deep", "MMGSD, deeper network", "mmgsd", {"network": "lite0x2"},
@@ -96,8 +96,8 @@ MODELS = (
           short="MMGSD, plain", colour="#F0A070"),
     Model("spcl_deep", "SPCL, dense, deeper network", "spcl_dense", {"network": "lite0x2"},
           short="SPCL, deeper", colour="#4477CC"),
-    Model("spcl_dense", "SPCL, dense supervision", "spcl", {"prototype_weight": 1.0},
-          short="SPCL, dense", colour="#88CCEE"),
+    Model("spcl_dense", "SPCL, dense supervision", "spcl", {"prototype_weight": 1.0}, FOUR,
+          "SPCL, dense", "#88CCEE"),
     Model("spcl", "SPCL", PRESET, {"method": "spcl", "margin": 4.0}, ("first", *FOUR), colour="#0072B2"),
     # as Dense Object Nets are trained (Florence et al. 2018): 3,500 steps of a pair of images as they are
     Model("spcl_reference", "SPCL, reference setting", PRESET,
@@ -151,7 +151,7 @@ def vary_sigma(sigmas_px: Sequence[float]) -> list[Model]:
 
 
 def vary_seed(seeds: Sequence[int]) -> list[Model]:
-    """A row for each of the four methods with each seed: "mmgsd-0", "mmgsd-1", …"""
+    """A row for each model compared by seeds, with each seed: "mmgsd-0", "mmgsd-1", …"""
     return [Model(f"{row.name}-{seed}", row.label, row.name, {"seed": seed}, ("seeds",))
             for row in list_rows("seeds") for seed in sorted(set(seeds))]  # fmt: skip
 

@@ -3,7 +3,7 @@
     python -m mmgsd.measure.matrix paper                              trains and asks each model; a killed call goes on
     python -m mmgsd.measure.matrix paper --only cloth-spcl            those whose name holds that text
     python -m mmgsd.measure.matrix paper --scheduler tcp://host:8786  each worker one model at a time, on its own GPU
-    python -m mmgsd.measure.matrix quick --seeds 3                    instead the four methods, each with three seeds
+    python -m mmgsd.measure.matrix quick --seeds 3                    instead the seeds study, each model with three
     python -m mmgsd.measure.matrix paper --study robustness           instead the models of one study
     python -m mmgsd.measure.matrix quick --study robustness --steps 300         each of so many steps
 
@@ -53,7 +53,7 @@ Task = TrainConfig | tuple[str, str]  # a model to train and ask, or an object a
 
 
 def list_repeats(preset: Preset, seeds: int, *, steps: int = 0) -> list[TrainConfig]:
-    """The four methods of the main table, of other ``steps`` than its where they are not 0: all with seed 0, then 1…"""
+    """The models compared by seeds, of other ``steps`` than its where they are not 0: all with seed 0, then 1…"""
     rows = vary_seed(range(seeds))
     keyed = {object: configure_study(preset, object, "seeds", rows, steps=steps) for object in OBJECTS}
     models = [keyed[object][row.name] for row in rows for object in OBJECTS]
@@ -217,7 +217,7 @@ def main() -> None:
     parser.add_argument("preset")
     parser.add_argument("--only", default="", help="those whose name holds this text, like cloth or cloth-spcl")
     parser.add_argument("--study", default="", choices=STUDIES, help="instead the models of one study")
-    parser.add_argument("--seeds", type=int, default=0, help="instead the four methods, each with so many seeds")
+    parser.add_argument("--seeds", type=int, default=0, help="instead the models compared by seeds, each with so many")
     parser.add_argument("--steps", type=int, default=0, help=f"of those, or of the study {' or '.join(TABLES)}")
     parser.add_argument("--scheduler", default="", help="address of a Dask scheduler; none: this process")
     args = parser.parse_args()
