@@ -9,9 +9,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import os
 import re
-from pathlib import Path
 from typing import Any, TypeVar
 
 from mmgsd.checks import check, check_choice, check_types
@@ -272,59 +270,3 @@ def from_dict(kind: type[Config], values: dict[str, Any]) -> Config:
     for key in values:
         check_choice(f"a key of {kind.__name__}", key, tuple(known))
     return kind(**values)
-
-
-@dataclasses.dataclass(frozen=True)
-class Paths:
-    """Where a preset's files lie below the repository's root."""
-
-    root: Path
-    preset: str
-
-    @property
-    def generated(self) -> Path:
-        """Large and reproducible, ignored by git."""
-        return self.root / "data" / "generated" / self.preset
-
-    def dataset(self, object: str) -> Path:
-        """The rendered data set of one object."""
-        return self.generated / object
-
-    def model(self, config: TrainConfig) -> Path:
-        """The folder of one trained model."""
-        return self.generated / "models" / config.name
-
-    def queries(self, name: str) -> Path:
-        """The table of one method's answers, one row a query."""
-        return self.generated / "queries" / f"{name}.parquet"
-
-    @property
-    def results(self) -> Path:
-        """Small tables that figures, README and report read."""
-        return self.root / "data" / "results" / self.preset
-
-    @property
-    def figures(self) -> Path:
-        """The paper's figures as this preset draws them."""
-        return self.root / "figures" / self.preset
-
-
-def find_shipped() -> Path:
-    """The folder of the shipped weights: within the package where it is installed, ``data/weights`` in a checkout."""
-    package = Path(__file__).resolve().parent
-    installed = package / "weights"
-    return installed if installed.is_dir() else package.parent / "data" / "weights"
-
-
-def find_root(start: Path | None = None) -> Path:
-    """The repository's root: the nearest folder upwards that holds ``environment.lock``, or MMGSD_ROOT.
-
-    Raises FileNotFoundError where neither is found.
-    """
-    if "MMGSD_ROOT" in os.environ:
-        return Path(os.environ["MMGSD_ROOT"])
-    start = Path.cwd() if start is None else start
-    for folder in (start, *start.parents, *Path(__file__).resolve().parents):
-        if (folder / "environment.lock").is_file():
-            return folder
-    raise FileNotFoundError("no environment.lock in this folder or above it: set MMGSD_ROOT to the repository")

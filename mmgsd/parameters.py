@@ -18,8 +18,9 @@ from collections.abc import Callable, Collection, Iterable, Mapping, MutableMapp
 from pathlib import Path
 from typing import Any
 
-from mmgsd.config import PRESETS, Paths, TrainConfig, find_root, find_shipped
+from mmgsd.config import PRESETS, TrainConfig
 from mmgsd.experiments import list_rows
+from mmgsd.paths import Paths, find_root, find_shipped
 
 Reader = Callable[[str, Any], Any]
 ADDRESS = re.compile(r"((tcp|tls|ws|wss|ucx)://)?(?P<host>\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+):(?P<port>[0-9]{1,5})")

@@ -17,7 +17,7 @@ from typing import Any
 
 import nbformat
 
-from mmgsd.config import find_root
+from mmgsd.paths import find_root
 
 ROOT = find_root(Path(__file__).parent)
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)

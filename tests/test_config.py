@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 
 import pytest
 
-from mmgsd import config as config_module
 from mmgsd.config import (
-    METHODS,
     OBJECTS,
     EvaluateConfig,
-    Paths,
     RenderConfig,
     TrainConfig,
     digest,
-    find_root,
     from_dict,
     load_preset,
     to_dict,
@@ -139,14 +134,6 @@ def test_a_name_that_is_none_of_a_file_is_refused(name: str) -> None:
         RenderConfig(object=name)
 
 
-def test_nothing_that_a_preset_keeps_lies_where_an_objects_data_may() -> None:
-    paths = Paths(Path("root"), "smoke")
-    kept = (paths.model(TrainConfig()), paths.queries("cloth"))
-    for folder in {path.relative_to(paths.generated).parts[0] for path in kept}:
-        with pytest.raises(ValueError, match="another name"):
-            RenderConfig(object=folder)
-
-
 def test_unknown_key_names_the_nearest_one() -> None:
     with pytest.raises(ValueError, match="a key of TrainConfig must be one of .*did you mean 'sigma_px'.*got 'sigma'"):
         from_dict(TrainConfig, {"sigma": 1.0})
@@ -171,28 +158,3 @@ def test_integer_and_float_are_one_configuration() -> None:
 def test_the_objects_own_group_is_filled_in() -> None:
     assert TrainConfig(object="rope").group == "c2"
     assert digest(TrainConfig()) == digest(TrainConfig(group="c4"))
-
-
-def test_model_folders_differ_between_configurations() -> None:
-    paths = Paths(Path("root"), "smoke")
-    configs = [TrainConfig(method=m, sigma_px=s) for m in METHODS for s in (1.0, 4.0)]
-    assert len({paths.model(c) for c in configs}) == len(configs)
-
-
-def test_find_root_from_a_subfolder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("MMGSD_ROOT", raising=False)
-    (tmp_path / "environment.lock").touch()
-    (tmp_path / "notebooks" / "deep").mkdir(parents=True)
-    assert find_root(tmp_path / "notebooks" / "deep") == tmp_path
-
-
-def test_find_root_prefers_the_environment_variable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("MMGSD_ROOT", str(tmp_path))
-    assert find_root() == tmp_path
-
-
-def test_find_root_without_a_repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("MMGSD_ROOT", raising=False)
-    monkeypatch.setattr(config_module, "__file__", str(tmp_path / "site" / "config.py"))
-    with pytest.raises(FileNotFoundError, match="environment.lock.*MMGSD_ROOT"):
-        find_root(tmp_path)

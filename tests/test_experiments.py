@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from mmgsd.config import METHODS, OBJECTS, TrainConfig, find_root, load_preset
+from mmgsd.config import METHODS, OBJECTS, TrainConfig, load_preset
 from mmgsd.experiments import (
     GREY,
     MODELS,
@@ -29,6 +29,7 @@ from mmgsd.experiments import (
 )
 from mmgsd.match.baselines import BASELINES
 from mmgsd.measure.evaluation import CHANCE
+from mmgsd.paths import find_root
 
 ROOT = find_root(Path(__file__).parent)
 PAPER = load_preset("paper")

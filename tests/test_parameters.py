@@ -15,7 +15,7 @@ from papermill.translators import PythonTranslator
 from PIL import Image
 
 from mmgsd import parameters
-from mmgsd.config import Paths, TrainConfig
+from mmgsd.config import TrainConfig
 from mmgsd.learn.training import train_model
 from mmgsd.parameters import (
     check_images,
@@ -31,6 +31,7 @@ from mmgsd.parameters import (
     read_scheduler,
     whole,
 )
+from mmgsd.paths import Paths
 
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))

@@ -30,7 +30,7 @@ from tqdm.auto import tqdm
 
 from mmgsd.checks import read_flag
 from mmgsd.command import run_command
-from mmgsd.config import OBJECTS, Paths, find_root, load_preset
+from mmgsd.config import OBJECTS, load_preset
 from mmgsd.dataset import Dataset, check_dataset, load_dataset
 from mmgsd.dataset_format import SPLITS, TABLES, find_owner, is_member
 from mmgsd.extras.croissant import write_croissant
@@ -47,6 +47,7 @@ from mmgsd.files import (
     writing,
 )
 from mmgsd.images import encode_image, encode_mask
+from mmgsd.paths import Paths, find_root
 
 QUALITY = 50  # of WebP, 1 to 100: 4,000 images with their labels stay under 60 MB
 LABEL_STEP = 1 / 16  # px that labels are rounded to

@@ -14,7 +14,7 @@ from pathlib import Path
 import torch
 
 from mmgsd.command import run_command
-from mmgsd.config import OBJECTS, Paths, TrainConfig, find_root, load_preset
+from mmgsd.config import OBJECTS, TrainConfig, load_preset
 from mmgsd.experiments import SHIPPED, configure_model
 from mmgsd.files import DamagedFileError, ForeignFileError, locked, set_aside, write_bytes, write_text
 from mmgsd.learn.checkpoints import WEIGHTS, load_metadata, read_config, read_tensors, write_tensors
@@ -22,6 +22,7 @@ from mmgsd.measure.calibration import calibrate_weights
 from mmgsd.measure.evaluation import read_results
 from mmgsd.measure.shipped import RESULTS, SETS
 from mmgsd.parameters import check_stored
+from mmgsd.paths import Paths, find_root
 
 CARD = """# {title}
 

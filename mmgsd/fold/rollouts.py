@@ -19,7 +19,7 @@ import numpy as np
 
 from mmgsd.checks import check_choice
 from mmgsd.command import run_command
-from mmgsd.config import DEFAULT_GROUP, OBJECTS, Paths, find_root
+from mmgsd.config import DEFAULT_GROUP, OBJECTS
 from mmgsd.figures.folding import mark_moves, plot_rollouts, save_slides
 from mmgsd.figures.style import save_figure
 from mmgsd.files import DamagedFileError, read_json, set_aside, write_json
@@ -30,6 +30,7 @@ from mmgsd.fold.moves import Answer, choose_moves
 from mmgsd.fold.policies import POLICIES, Policy, ask, digest_policy, draw_moves
 from mmgsd.fold.tasks import GROUNDS, TASKS, Task
 from mmgsd.match.camera import compute_rays
+from mmgsd.paths import Paths, find_root
 from mmgsd.progress import ProgressBar
 from mmgsd.scene.folding import act_job, demonstration_job, run_jobs, start_job, true_moves
 from mmgsd.scene.state import State, read_state

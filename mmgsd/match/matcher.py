@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mmgsd.config import CONTRASTIVE, TrainConfig, find_shipped
+from mmgsd.config import CONTRASTIVE, TrainConfig
 from mmgsd.images import check_aspect, check_mask, check_pixels, to_rgb
 from mmgsd.learn.heads import Outputs, look_up, weigh_cells
 from mmgsd.learn.losses import compute_squared_distances
@@ -25,6 +25,7 @@ from mmgsd.match.calibration import Calibration
 from mmgsd.match.match import Match
 from mmgsd.match.mixture import AS_IT_IS, Mixture, Reading, check_count, check_modes, fit_modes, keep_most_probable
 from mmgsd.match.weights import read_weights
+from mmgsd.paths import find_shipped
 
 QUARTERS = 4  # turns of an image whose descriptors are averaged: what noise they have differs
 SIZES_PX = (16, 65536)  # of the images that a model was taught with

@@ -21,7 +21,7 @@ from tqdm.auto import tqdm
 
 from mmgsd.checks import read_count
 from mmgsd.command import run_command
-from mmgsd.config import OBJECTS, Paths, Preset, TrainConfig, find_root, load_preset
+from mmgsd.config import OBJECTS, Preset, TrainConfig, load_preset
 from mmgsd.experiments import (
     RUN,
     STUDIES,
@@ -45,6 +45,7 @@ from mmgsd.measure.evaluation import (
     write_results,
 )
 from mmgsd.parameters import read_scheduler
+from mmgsd.paths import Paths, find_root
 
 TABLES = ("budget", "robustness")  # studies with a file of their own, of the preset's models under their rows' names
 VALIDATIONS = 8  # RMSE on held-out simulations, in a model's log

@@ -34,12 +34,12 @@ import numpy as np
 import pandas as pd
 from tqdm.auto import tqdm
 
-from mmgsd.config import find_root
 from mmgsd.dataset import load_dataset
 from mmgsd.files import DamagedFileError, read_json, write_json, write_text
 from mmgsd.images import check_pixels, read_image
 from mmgsd.match.match import Match
 from mmgsd.match.matcher import Matcher, find_weights
+from mmgsd.paths import find_root
 
 SOURCES = 4  # photographs whose places are asked for
 INDEX = "index.json"  # of a folder of photographs

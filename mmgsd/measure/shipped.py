@@ -27,7 +27,7 @@ import pandas as pd
 
 from mmgsd.checks import read_count
 from mmgsd.command import run_command
-from mmgsd.config import OBJECTS, PRESETS, EvaluateConfig, Paths, Preset, find_root, load_preset
+from mmgsd.config import OBJECTS, PRESETS, EvaluateConfig, Preset, load_preset
 from mmgsd.dataset import load_dataset
 from mmgsd.experiments import configure_study
 from mmgsd.files import read_json, write_json
@@ -50,6 +50,7 @@ from mmgsd.measure.uncertainty import (
     measure_modes,
     summarise_uncertainty,
 )
+from mmgsd.paths import Paths, find_root
 
 STUDY = "robustness"
 SETS = ("paper", "workspace")  # presets whose test images are asked about

@@ -15,8 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from mmgsd.command import run_command
-from mmgsd.config import IMAGE_SIZE, Paths, find_root, load_preset
+from mmgsd.config import IMAGE_SIZE, load_preset
 from mmgsd.files import write_text
+from mmgsd.paths import Paths, find_root
 from mmgsd.report import latex_tables as tables
 from mmgsd.report.claims import list_claims
 from mmgsd.report.findings import describe_claims

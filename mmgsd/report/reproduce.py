@@ -24,7 +24,8 @@ from typing import Any, TextIO
 import psutil
 
 from mmgsd.command import run_command
-from mmgsd.config import PRESETS, Paths, find_root
+from mmgsd.config import PRESETS
+from mmgsd.paths import Paths, find_root
 from mmgsd.progress import TOLD
 from mmgsd.report.stages import estimate_left, find_run, load_minutes, load_state
 

@@ -13,8 +13,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from mmgsd.config import Paths
 from mmgsd.files import DamagedFileError, locked, set_aside, write_json
+from mmgsd.paths import Paths
 from mmgsd.report.results import REMEDY, read_table
 
 

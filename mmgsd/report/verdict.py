@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from mmgsd.config import Paths
 from mmgsd.experiments import UNTRAINED
 from mmgsd.files import DamagedFileError, set_aside, write_json, write_text
+from mmgsd.paths import Paths
 from mmgsd.report.claims import get
 from mmgsd.report.results import read_table, told_where
 from mmgsd.report.stages import find_run

@@ -27,16 +27,7 @@ from dask.distributed import Client, LocalCluster, as_completed
 from dask.system import cpu_count
 
 from mmgsd.checks import read_count, read_flag
-from mmgsd.config import (
-    ADDED,
-    DEFAULT_GROUP,
-    OBJECTS,
-    OWN_GROUP,
-    RenderConfig,
-    drop_added,
-    find_root,
-    to_dict,
-)
+from mmgsd.config import ADDED, DEFAULT_GROUP, OBJECTS, OWN_GROUP, RenderConfig, drop_added, to_dict
 from mmgsd.dataset import load_dataset
 from mmgsd.dataset_format import FORMAT, SPLITS, encode_table, find_owner, is_member
 from mmgsd.files import (
@@ -53,6 +44,7 @@ from mmgsd.files import (
     write_bytes,
     write_json,
 )
+from mmgsd.paths import find_root
 from mmgsd.progress import ProgressBar
 from mmgsd.scene.sheet import Sheet, load_sheet
 from mmgsd.symmetry import GRID_GROUPS, LINE_GROUPS, load_group, load_mirror

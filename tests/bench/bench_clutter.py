@@ -11,10 +11,11 @@ import statistics
 import torch
 from bench_learning import measure_pace
 
-from mmgsd.config import OBJECTS, Paths, find_root, load_preset
+from mmgsd.config import OBJECTS, load_preset
 from mmgsd.experiments import configure_model
 from mmgsd.files import write_json
 from mmgsd.learn.training import name_hardware
+from mmgsd.paths import Paths, find_root
 
 ROUNDS = 2
 

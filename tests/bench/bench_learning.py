@@ -20,13 +20,14 @@ from pathlib import Path
 
 import pandas as pd
 
-from mmgsd.config import METHODS, OBJECTS, Paths, TrainConfig, find_root, load_preset
+from mmgsd.config import METHODS, OBJECTS, TrainConfig, load_preset
 from mmgsd.dataset import hold_out, load_dataset
 from mmgsd.experiments import configure_model
 from mmgsd.learn.checkpoints import LOG, load_metadata
 from mmgsd.learn.training import train_model
 from mmgsd.match.matcher import Matcher
 from mmgsd.measure.questions import measure_rmse
+from mmgsd.paths import Paths, find_root
 
 PACE_STEPS = 20  # steps that the pace is measured on, after as many to warm up
 

@@ -10,11 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from mmgsd.config import OBJECTS, EvaluateConfig, Paths, find_root, load_preset
+from mmgsd.config import OBJECTS, EvaluateConfig, load_preset
 from mmgsd.experiments import configure_model
 from mmgsd.extras.packing import unpack_dataset
 from mmgsd.learn.checkpoints import WEIGHTS
 from mmgsd.measure.evaluation import evaluate_model, load_queries
+from mmgsd.paths import Paths, find_root
 
 QUESTIONS = EvaluateConfig(pairs=100, points=125)
 

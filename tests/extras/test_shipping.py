@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from mmgsd.config import TrainConfig, find_root
+from mmgsd.config import TrainConfig
 from mmgsd.dataset import load_dataset
 from mmgsd.extras.shipping import restore_model, ship_model
 from mmgsd.files import ForeignFileError, LockedError, locked
 from mmgsd.learn.training import train_model
 from mmgsd.match.matcher import Matcher, load
+from mmgsd.paths import find_root
 
 CARDS = sorted((find_root(Path(__file__).parent) / "data" / "weights").glob("*.md"))
 ERRORS = {"rmse_mean": 12.34, "median": 10.0, "queries": 1234}

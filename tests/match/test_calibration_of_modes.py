@@ -11,12 +11,12 @@ import pytest
 import torch
 from heatmaps import CELLS, CORNERS, SIZE, draw_mixture
 
-from mmgsd.config import find_root
 from mmgsd.dataset import load_dataset
 from mmgsd.learn.network import compute_cell_centres
 from mmgsd.match.calibration import LEVELS, Calibration, Gaussian, Modes, parse_calibration
 from mmgsd.match.match import Match
 from mmgsd.match.matcher import load, make_match
+from mmgsd.paths import find_root
 
 TABLE = tuple(float(level / (1 - level)) for level in LEVELS)
 KNOWN = Calibration(ellipse=TABLE, radius=TABLE, powers=(0.9, -0.2, 0.3), pairs=100)

@@ -12,9 +12,10 @@ import torch
 from heatmaps import SIZE
 from safetensors.torch import save_file
 
-from mmgsd.config import TrainConfig, find_root
+from mmgsd.config import TrainConfig
 from mmgsd.learn.network import build_network
 from mmgsd.match.matcher import Matcher, load
+from mmgsd.paths import find_root
 
 CONFIG = TrainConfig(input_px=64, descriptor_dim=8)
 

@@ -9,7 +9,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from mmgsd.config import find_root
 from mmgsd.dataset import load_dataset
 from mmgsd.match.match import Match
 from mmgsd.match.matcher import Matcher
@@ -24,6 +23,7 @@ from mmgsd.measure.figure_data import (
     save_figure_data,
 )
 from mmgsd.measure.metrics import ErrorSummary, summarise_errors
+from mmgsd.paths import find_root
 
 
 def make_queries(errors: list[float], visible: list[bool]) -> pd.DataFrame:

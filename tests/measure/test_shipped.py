@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 from test_heads_measured import write_weights
 
-from mmgsd.config import EvaluateConfig, Paths, load_preset
+from mmgsd.config import EvaluateConfig, load_preset
 from mmgsd.experiments import configure_study
 from mmgsd.measure import shipped
 from mmgsd.measure.shipped import Masked, main, measure_baseline, measure_read, measure_study, measure_weights
+from mmgsd.paths import Paths
 
 SAMPLE = Path(__file__).parents[2] / "data" / "sample"
 

@@ -15,7 +15,7 @@ from typing import Any
 import psutil
 import pytest
 
-from mmgsd.config import Paths
+from mmgsd.paths import Paths
 from mmgsd.report import reproduce
 from mmgsd.report.reproduce import Screen, describe_failure, describe_state, running
 from mmgsd.report.stages import find_run

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from mmgsd.config import Paths
 from mmgsd.files import DamagedFileError, LockedError
+from mmgsd.paths import Paths
 from mmgsd.report import stages
 from mmgsd.report.stages import Run, estimate_left, find_run, load_minutes, load_state
 

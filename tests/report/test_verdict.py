@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from mmgsd.config import Paths
+from mmgsd.paths import Paths
 from mmgsd.report.verdict import (
     MEASURES,
     compare_files,

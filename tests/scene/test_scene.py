@@ -13,7 +13,8 @@ from scipy.ndimage import binary_erosion, distance_transform_edt
 
 bpy = pytest.importorskip("bpy")
 
-from mmgsd.config import RenderConfig, find_root  # noqa: E402
+from mmgsd.config import RenderConfig  # noqa: E402
+from mmgsd.paths import find_root  # noqa: E402
 from mmgsd.scene import SceneError, cloth, episode, randomize, render, textures  # noqa: E402
 from mmgsd.scene.sheet import load_sheet  # noqa: E402
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mmgsd.config import find_root
+from mmgsd.paths import find_root
 from mmgsd.scene.meshes import SPACING
 from mmgsd.scene.sheet import Sheet, load_sheet, turn, turn_over
 

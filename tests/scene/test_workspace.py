@@ -13,7 +13,8 @@ from scipy.ndimage import distance_transform_edt
 
 bpy = pytest.importorskip("bpy")
 
-from mmgsd.config import RenderConfig, find_root  # noqa: E402
+from mmgsd.config import RenderConfig  # noqa: E402
+from mmgsd.paths import find_root  # noqa: E402
 from mmgsd.scene import cloth, grounds, materials, prints, render, solids, things, workspace  # noqa: E402
 from mmgsd.scene.episode import render_episode  # noqa: E402
 from mmgsd.scene.render import DeformedObject  # noqa: E402
