@@ -14,7 +14,13 @@ import numpy as np
 from mmgsd.match.calibration import Calibration, Gaussian, Modes, compute_share
 
 RADIUS_PX = 20.0  # of a training image, within which a robot's grasp still holds, unless the caller says otherwise
-SHARED = ("image0", "image1", "scale", "calibration")  # fields of all queries; of others the first axis counts queries
+SHARED = (
+    "image0",
+    "image1",
+    "scale",
+    "calibration",
+    "joint",
+)  # fields of all queries; of others the first axis counts queries
 
 
 @dataclass(frozen=True)
@@ -37,7 +43,7 @@ class Match:
     image0: np.ndarray  # (H0, W0, 3) uint8
     image1: np.ndarray  # (H1, W1, 3) uint8
     xy: np.ndarray  # (S, 2) px in image0
-    modes: np.ndarray  # (S, n, 2) px in image1, most probable first; NaN for absent ones
+    modes: np.ndarray  # (S, n, 2) px in image1, most probable first, or as ``joint`` says; NaN for absent ones
     weights: np.ndarray  # (S, n), sum to 1 over the modes that are here, also where fewer were kept than fitted
     covariances: np.ndarray  # (S, n, 2, 2) px²
     entropy: np.ndarray  # (S,) nats, of the density over px of a training image, whatever the size of image1
@@ -47,6 +53,9 @@ class Match:
     visible: np.ndarray | None = None  # (S, n) in [0, 1], whether each mode's match is seen there, or hidden
     on_object: np.ndarray | None = None  # (S,) in [0, 1], whether the pixel asked about shows the object
     absent: np.ndarray | None = None  # (S,) in [0, 1], whether image1 does not show the object at all
+    # (n,) of a joint answer: modes[:, g] are of one member of the symmetry, and weigh so much over the whole object, on
+    # average; the heaviest first. None: each query has an order of its own
+    joint: np.ndarray | None = None
     scale: float = 1.0  # px of image1 by px of an image of the size that the model was taught with
     calibration: Calibration | None = None  # None: ellipses, radii and confidences promise what a Gaussian would
 
@@ -125,6 +134,8 @@ class Match:
         rows = np.arange(len(self.modes))
         spread = np.nan_to_num(self.spread_px, nan=np.inf)
         hidden = np.zeros(spread.shape, bool) if self.visible is None else self.visible < 0.5
+        if self.joint is not None and len(self):
+            spread, hidden = (np.broadcast_to(values.mean(0), spread.shape) for values in (spread, hidden))
         chosen = np.lexsort((spread, hidden), axis=1)[:, 0]
         confidence = self.confidence(radius_px=radius_px)[rows, chosen]
         able = (confidence >= min_confidence) & self.answerable
@@ -170,6 +181,20 @@ class Match:
         from mmgsd.figures.plots import plot_match
 
         return plot_match(self, index)
+
+
+def sort_modes(match: Match, order: np.ndarray, joint: np.ndarray) -> Match:
+    """The same answer with the modes in an ``order`` (S, k) of indices, that of ``joint`` (k,)."""
+    weights = np.take_along_axis(match.weights, order, 1)
+    total = weights.sum(1, keepdims=True)
+    return dataclasses.replace(
+        match,
+        modes=np.take_along_axis(match.modes, order[..., None], 1),
+        weights=np.divide(weights, total, out=weights, where=total > 0),
+        covariances=np.take_along_axis(match.covariances, order[..., None, None], 1),
+        visible=None if match.visible is None else np.take_along_axis(match.visible, order, 1),
+        joint=joint / joint.sum(),
+    )
 
 
 def _is_mask(index: Any) -> bool:

@@ -16,13 +16,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mmgsd.checks import read_flag
 from mmgsd.config import CONTRASTIVE, TrainConfig
 from mmgsd.images import check_aspect, check_mask, check_pixels, to_rgb
 from mmgsd.learn.heads import Outputs, look_up, weigh_cells
 from mmgsd.learn.losses import compute_squared_distances
 from mmgsd.learn.network import compute_cell_centres, find_device, fit_input_size, sample_descriptors
 from mmgsd.match.calibration import Calibration
-from mmgsd.match.match import Match
+from mmgsd.match.joint import join, spread_places
+from mmgsd.match.match import Match, sort_modes
 from mmgsd.match.mixture import AS_IT_IS, Mixture, Reading, check_count, check_modes, fit_modes, keep_most_probable
 from mmgsd.match.weights import read_weights
 from mmgsd.paths import find_shipped
@@ -173,13 +175,20 @@ class Matcher:
         mask = self.describe([image])[0].mask
         if mask is None:
             raise ValueError(f"these weights of {self.config.name} learnt no mask: load others, like 'cloth' or 'rope'")
-        return cv2.resize(mask.sigmoid().cpu().numpy(), image.shape[1::-1], interpolation=cv2.INTER_LINEAR)
+        return self.resize_mask(mask, image.shape[1::-1])
+
+    def resize_mask(self, logits: Tensor, size: tuple[int, int]) -> np.ndarray:
+        """(H, W) float32 in [0, 1] of an image of ``size`` (width, height), from an `Outputs.mask` (h, w)."""
+        return cv2.resize(logits.sigmoid().cpu().numpy(), size, interpolation=cv2.INTER_LINEAR)
 
     def _sample_sources(self, said0: Outputs, xy: Tensor, size: tuple[int, int]) -> Tensor:
         sources = said0.descriptors[None, : self.config.descriptor_dim]
         return sample_descriptors(sources, xy[None].to(self.device).float(), size)
 
-    def match(self, image0: Any, image1: Any, xy: Any, *, n: Any = None, mask0: Any = None, mask1: Any = None) -> Match:
+    def match(
+        self, image0: Any, image1: Any, xy: Any, *, n: Any = None, mask0: Any = None, mask1: Any = None,
+        joint: bool = False,
+    ) -> Match:  # fmt: skip
         """All matches in ``image1`` of the pixels ``xy`` (S, 2), or of the one pixel (2,), of ``image0``.
 
         Images are of any size and each of its own, and of any kind that `mmgsd.images.to_rgb` takes; they are copied.
@@ -187,23 +196,30 @@ class Matcher:
         "auto" finds their number. The group's number is fitted even where fewer are asked for: of these the most
         probable are the answer, and their weights are divided by their sum. ``mask0`` and ``mask1``, (H, W) bool each,
         say where the images show the object, from any segmenter of yours: the network's own masks then do not count.
-        ValueError for other images or masks, for ``xy`` outside image0, or for ``n`` that is not from 1 to `MAX_MODES`.
+        With ``joint``, all pixels are answered under the same member of the symmetry: ``modes[:, g]`` belong together,
+        the g-th of the consistent answers, and ``joint`` (n,) of the `Match` says how much each weighs. That asks about
+        places all over the object besides (`mmgsd.match.joint`), so where it lies in image0 must be known: from weights
+        that learnt a mask, or ``mask0``.
+        ValueError for other images or masks, for ``xy`` outside image0, for ``n`` that is not from 1 to `MAX_MODES`, or
+        with ``joint`` from 1 to the group's number, and for ``joint`` without a mask.
         """
-        return self.prepare(image0, image1, mask0=mask0, mask1=mask1).match(xy, n=n)
+        return self.prepare(image0, image1, mask0=mask0, mask1=mask1).match(xy, n=n, joint=joint)
 
     def prepare(self, image0: Any, image1: Any, *, mask0: Any = None, mask1: Any = None) -> Pair:
         """Describe two images once, to ask about them many times; arguments and errors are those of `match`."""
         return self._prepare(image0, image1, self.describe, mask0=mask0, mask1=mask1)
 
-    def match_many(self, questions: Iterable[tuple[Any, Any, Any]], *, n: Any = None) -> Iterator[Match]:
+    def match_many(
+        self, questions: Iterable[tuple[Any, Any, Any]], *, n: Any = None, joint: bool = False
+    ) -> Iterator[Match]:
         """The answers to many questions (image0, image1, xy), each when it is asked for, so in little memory.
 
-        An image that comes again soon, by its pixels, is described once: a reference before many frames. ``n`` and
-        errors are those of `match`; after an error there is no further answer.
+        An image that comes again soon, by its pixels, is described once: a reference before many frames. ``n``,
+        ``joint`` and errors are those of `match`; after an error there is no further answer.
         """
         recent = _Recent(self.describe)
         for image0, image1, xy in questions:
-            yield self._prepare(image0, image1, recent.describe).match(xy, n=n)
+            yield self._prepare(image0, image1, recent.describe).match(xy, n=n, joint=joint)
 
     def _prepare(
         self, image0: Any, image1: Any, describe: Callable[[list[np.ndarray]], list[Outputs]], *, mask0: Any = None,
@@ -250,10 +266,31 @@ class Pair:
     mask1: np.ndarray | None = None  # (H1, W1) bool
 
     @torch.inference_mode()
-    def match(self, xy: Any, *, n: Any = None) -> Match:
+    def match(self, xy: Any, *, n: Any = None, joint: bool = False) -> Match:
         """As `Matcher.match`."""
+        points = check_pixels(xy, self.image0.shape[1::-1])
+        if not read_flag("joint", joint):
+            return self._match(points, n)
+        count = check_answers(self.matcher.modes if n is None else n, self.matcher.modes)
+        mask = self._find_mask()
+        places = spread_places(mask)
+        match = self._match(np.concatenate([points, places.astype(points.dtype)]), None)
+        order = join(match.xy, mask, match.modes, match.weights, match.spread_px, places=len(places))
+        weights = np.take_along_axis(match.weights, order, 1)
+        told = weights[len(points) :] if len(places) else weights
+        return sort_modes(match[: len(points)], order[: len(points), :count], told.mean(0)[:count])
+
+    def _find_mask(self) -> np.ndarray:
+        """(H0, W0) bool, where image0 shows the object."""
+        if self.mask0 is not None:
+            return self.mask0
+        if self.said[0].mask is None:
+            raise ValueError("joint must be False, or mask0 be given: these weights of "
+                             f"{self.matcher.config.name} learnt no mask")  # fmt: skip
+        return self.matcher.resize_mask(self.said[0].mask, self.image0.shape[1::-1]) >= 0.5
+
+    def _match(self, points: np.ndarray, n: Any) -> Match:
         size0, size1 = sizes = tuple((im.shape[1], im.shape[0]) for im in (self.image0, self.image1))
-        points = check_pixels(xy, size0)
         mask1 = None if self.mask1 is None else torch.from_numpy(self.mask1)
         cells = self.matcher.compute_heatmaps(*self.said, torch.from_numpy(points), size0, mask1=mask1)
         centres = compute_cell_centres(size1, cells.shape[-2:])
@@ -313,6 +350,14 @@ def make_match(
     arrays = (t.cpu().numpy() for t in (fit.modes, fit.weights, fit.covariances, entropy, fit.outside, cells))
     match = Match(image0, image1, xy, *arrays, scale=scale)
     return dataclasses.replace(match, entropy=match.entropy - np.float32(2 * math.log(scale)))
+
+
+def check_answers(n: Any, most: int) -> int:
+    """How many joint answers are wanted; ValueError for what is not a whole number from 1 to the ``most`` there are."""
+    whole = isinstance(n, int | np.integer) and not isinstance(n, bool)
+    if not whole or not 1 <= n <= most:
+        raise ValueError(f"n must be a whole number from 1 to {most} with joint, got {n!r:.80}")
+    return int(n)
 
 
 def compute_scale(size: tuple[int, int], trained: tuple[int, int]) -> float:
