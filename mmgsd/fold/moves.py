@@ -22,7 +22,7 @@ from mmgsd.match.match import Match
 from mmgsd.match.matcher import Matcher
 
 Plane = Callable[[np.ndarray], np.ndarray]  # pixels (…, 2) to places (…, 2) of the plane that motions are in
-AGREE, BEST = "agree", "best"  # how one mode of each question is chosen
+AGREE, BEST, JOINT = "agree", "best", "joint"  # how one mode of each question is chosen
 RIGID = 0.7  # share of the questions that agree where an object lies as it was shown
 LEAST = 0.5  # share of the questions that must agree before a picture of a user's is answered
 
@@ -45,12 +45,12 @@ def choose_moves(
     ``seen`` and ``shown`` take pixels of the look's image and of the new one to the plane. "agree": the motion that
     most modes agree with, or that of an earlier look; each pick is its mode near to where the motion takes it, or that
     place. Where less than `RIGID` agree, the object is bent otherwise than shown: the motion is the best for all, and
-    each pick its nearest mode. "best": each pixel's `Match.best`, and the motion that fits them all. Places are where
-    the motion takes them.
+    each pick its nearest mode. "best": each pixel's `Match.best`, and the motion that fits them all; "joint" the same,
+    for a ``match`` that is joint: all take the same member of the symmetry. Places are where the motion takes them.
     """
     asked, modes = seen(look.asked), shown(match.modes)
     picks, places = seen(look.moves[:, 0]), seen(look.moves[:, 1])
-    if chosen == BEST:
+    if chosen in (BEST, JOINT):
         surest = shown(match.best().xy)
         known = np.isfinite(surest).all(1)
         if not known[: len(picks)].all() or known.sum() < 2:
@@ -90,9 +90,9 @@ def answer_picture(
     if matcher.object and matcher.object != demonstration.object:
         raise ValueError(f"weights must be of the demonstration's object {demonstration.object!r}, got weights of "
                          f"{matcher.object!r}")  # fmt: skip
-    check_choice("chosen", chosen, (AGREE, BEST))
+    check_choice("chosen", chosen, (AGREE, BEST, JOINT))
     shown = demonstration.looks[look]
-    match = matcher.match(shown.image, image, shown.asked)
+    match = matcher.match(shown.image, image, shown.asked, joint=chosen == JOINT)
     if match.on_object is not None and (match.on_object < 0.5).any():
         off = shown.asked[match.on_object < 0.5].tolist()
         raise ValueError(f"picks and anchors must be on the object of the demonstration, these are not: {off}")

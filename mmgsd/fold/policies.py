@@ -12,7 +12,7 @@ import numpy as np
 from mmgsd.checks import check_choice
 from mmgsd.config import DEFAULT_GROUP
 from mmgsd.fold.demonstration import Look
-from mmgsd.fold.moves import AGREE, BEST
+from mmgsd.fold.moves import AGREE, BEST, JOINT
 from mmgsd.match.baselines import BaselineMatcher
 from mmgsd.match.match import Match
 from mmgsd.match.matcher import Matcher, find_weights
@@ -30,6 +30,7 @@ class Policy:
     colour: str
     matcher: str = ""  # what follows the object in the name of shipped weights ("" with ``chosen``), or a baseline
     chosen: str = ""
+    looks: int = 1  # where few of its modes agree, it looks so often, each time from elsewhere, before it acts
 
 
 POLICIES = {
@@ -37,6 +38,8 @@ POLICIES = {
     for policy in (
         Policy("truth", "true matches", "#404040"),
         Policy("mmgsd", "MMGSD, modes that agree", "#D55E00", "", AGREE),
+        Policy("mmgsd_again", "the same, looks again if unsure", "#8A3500", "", AGREE, 3),
+        Policy("mmgsd_joint", "MMGSD, surest joint answer", "#F0A070", "", JOINT),
         Policy("mmgsd_best", "MMGSD, each pixel's surest", "#A6761D", "", BEST),
         Policy("spcl", "SPCL, modes that agree", "#0072B2", "-spcl", AGREE),
         Policy("daisy", "DAISY, modes that agree", "#E69F00", "daisy", AGREE),
@@ -71,7 +74,7 @@ def digest_policy(policy: Policy, object: str) -> str:
 def ask(policy: Policy, object: str, look: Look, image: np.ndarray, mask: np.ndarray) -> Match:
     """The matches of a look's picks and anchors in an image; baselines are told the object's ``mask`` (H, W) bool."""
     matcher = load_matcher(policy, object)
-    told = {"mask1": mask} if isinstance(matcher, BaselineMatcher) else {}
+    told = {"mask1": mask} if isinstance(matcher, BaselineMatcher) else {"joint": policy.chosen == JOINT}
     return matcher.match(look.image, image, look.asked, **told)
 
 

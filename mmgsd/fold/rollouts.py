@@ -32,7 +32,7 @@ from mmgsd.fold.tasks import GROUNDS, TASKS, Task
 from mmgsd.match.camera import compute_rays
 from mmgsd.paths import Paths, find_root
 from mmgsd.progress import ProgressBar
-from mmgsd.scene.folding import act_job, demonstration_job, run_jobs, start_job, true_moves
+from mmgsd.scene.folding import act_job, demonstration_job, look_job, run_jobs, start_job, true_moves
 from mmgsd.scene.state import State, read_state
 from mmgsd.symmetry import load_group
 
@@ -170,6 +170,8 @@ class Bench:
             going = [arm for arm in files if len(TASKS[arm[1].task].looks) > number]
             for arm in ProgressBar(going, desc="answer", disable=not self.how["progress"], leave=False):
                 answers[arm].append(self._answer(*arm, number, files[arm], answers[arm]))
+            self._look_again(going, number, files, answers)
+            for arm in going:
                 self.acted.setdefault(arm, []).append((files[arm], answers[arm][-1]))
             names = {arm: f"{arm[0].name}-{arm[1].name}-{number}" for arm in going}
             jobs = {names[arm]: act_job(files[arm], answers[arm][-1].moves.tolist()) for arm in going}
@@ -178,6 +180,23 @@ class Bench:
         self.ends |= files
         return {policy.name: {rollout.name: self._judge(rollout, files[policy, rollout], answers[policy, rollout])
                               for rollout in rollouts} for policy in policies}  # fmt: skip
+
+    def _look_again(
+        self, going: list[tuple[Policy, Rollout]], number: int, files: dict[tuple[Policy, Rollout], Path],
+        answers: dict[tuple[Policy, Rollout], list[Answer]],
+    ) -> None:  # fmt: skip
+        """Put the look and the answer in place that most questions agree in, where a policy looks again if few do."""
+        first = {arm: files[arm] for arm in going}
+        for again in range(1, max(policy.looks for policy, _ in going)):
+            unsure = [arm for arm in going if arm[0].looks > again and answers[arm][-1].share < AGREES]
+            names = {arm: f"{arm[0].name}-{arm[1].name}-{number}-look{again}" for arm in unsure}
+            made = run_jobs({names[arm]: look_job(first[arm], again) for arm in unsure}, self.folder / "acts",
+                            **self.how)  # fmt: skip
+            for arm in unsure:
+                file = made[names[arm]]
+                answer = self._answer(*arm, number, file, answers[arm][:-1], again=again)
+                if answer.share > answers[arm][-1].share:
+                    files[arm], answers[arm][-1] = file, answer
 
     def list_pictures(
         self, policies: list[Policy], rollouts: list[Rollout], starts: dict[Rollout, Path]
@@ -205,10 +224,13 @@ class Bench:
             slides.append((shown[-1].image, read_state(self.ends[arm]).image))
         return slides
 
-    def _answer(self, policy: Policy, rollout: Rollout, number: int, file: Path, before: list[Answer]) -> Answer:
+    def _answer(
+        self, policy: Policy, rollout: Rollout, number: int, file: Path, before: list[Answer], *, again: int = 0
+    ) -> Answer:
         """The moves (px) of one look, kept as a file; asked anew where the state or the policy is another."""
         state, task = read_state(file), TASKS[rollout.task]
-        place = self.folder / "answers" / f"{policy.name}-{rollout.name}-{number}.json"
+        look = f"-look{again}" if again else ""
+        place = self.folder / "answers" / f"{policy.name}-{rollout.name}-{number}{look}.json"
         mark = {"state": state.about["mark"], "policy": digest_policy(policy, task.object)}
         kept = _read_answer(place, mark)
         if kept is None:

@@ -23,7 +23,7 @@ from mmgsd.progress import ProgressBar
 from mmgsd.scene.rendering import RenderError, connect, explain, run_child
 from mmgsd.scene.state import State, read_state
 
-__all__ = ["State", "act_job", "demonstration_job", "read_state", "run_jobs", "start_job", "true_moves"]
+__all__ = ["State", "act_job", "demonstration_job", "look_job", "read_state", "run_jobs", "start_job", "true_moves"]
 
 VERSION = 1  # to be raised where the same job gives another state than before
 JOBS_A_BATCH = 12  # a child process ends after so many at most: it takes seconds to start
@@ -59,6 +59,16 @@ def act_job(state: Path, moves: Sequence[PixelMove]) -> dict:
     accepted = "pairs of finite pixels ((x, y), (x, y))"
     check("moves", moves, accepted, pixels.shape[1:] in ((2, 2), (4,)) and bool(np.isfinite(pixels).all()))
     job = {"kind": "act", "after": read_state(state).about["mark"], "moves": pixels.reshape(-1, 2, 2).tolist()}
+    return _marked(job) | {"state": str(state)}
+
+
+def look_job(state: Path, again: int) -> dict:
+    """The state in a file, seen by another camera, the ``again``-th.
+
+    DamagedFileError where the file is no state; ValueError where ``again`` is not at least 1.
+    """
+    check("again", again, "at least 1", read_count("again", again) >= 1)
+    job = {"kind": "look", "after": read_state(state).about["mark"], "again": int(again)}
     return _marked(job) | {"state": str(state)}
 
 
@@ -136,7 +146,7 @@ def _run_missing(client: Client, jobs: dict[str, dict], files: dict[str, Path], 
 
 def _pack(job: dict) -> tuple[dict, bytes]:
     """A job, and the file of the state that it goes on from: a worker elsewhere sees no files of this machine."""
-    return job, Path(job["state"]).read_bytes() if job["kind"] == "act" else b""
+    return job, Path(job["state"]).read_bytes() if "state" in job else b""
 
 
 def _make_batch(jobs: dict[str, tuple[dict, bytes]]) -> dict[str, bytes]:

@@ -56,6 +56,8 @@ def run_job(job: dict[str, Any], out: Path) -> Path:
     """Make the state of a job of `mmgsd.scene.folding` and write it to ``out``; ValueError for an unknown task."""
     if job["kind"] == "act":
         return write_state(out, act(read_state(job["state"]), job["moves"], job["mark"]))
+    if job["kind"] == "look":
+        return write_state(out, look_again(read_state(job["state"]), job["again"], job["mark"]))
     return write_state(out, begin(job))
 
 
@@ -82,6 +84,8 @@ def _stream(about: dict[str, Any], purpose: str) -> np.random.Generator:
     words = [about["task"], about["start"], purpose]
     if purpose in ("camera", "look"):
         words += [about["ground"]]
+    if purpose == "camera" and about.get("again"):
+        words += [str(about["again"])]
     return np.random.default_rng([about["seed"], int(about["demonstration"]), zlib.crc32(" ".join(words).encode())])
 
 
@@ -236,6 +240,14 @@ def meet_table(camera: Camera, xy: Sequence[float]) -> np.ndarray | None:
 
 
 # Looks. -------------------------------------------------------------------------------------------------------------
+
+
+def look_again(state: State, again: int, mark: str) -> State:
+    """The same state, seen by the camera of another number than the rollout's own, which is 0; at rest meanwhile."""
+    about = state.about | {"again": again, "mark": mark}
+    if about["fault"]:
+        return dataclasses.replace(state, about=about)
+    return _look(state.vertices, state.first, about)
 
 
 def _look(vertices: np.ndarray, first: np.ndarray | None, about: dict[str, Any]) -> State:
