@@ -75,7 +75,7 @@ def join(
     for rows in (np.concatenate([part, last]) for part in given):
         order = _join(*(values[rows] for values in (xy, modes, weights, spread)), mask).order
         if common is None:
-            heavy = np.take_along_axis(weights[rows], order, 1)[-places:].mean(0)  # of all, where there are no places
+            heavy = np.take_along_axis(weights[rows], order, 1)[-places:].sum(0)  # of all, where there are no places
             order = order[:, np.argsort(-heavy, kind="stable")]
             common = order[len(rows) - places :]
         elif places:

@@ -162,7 +162,7 @@ class Matcher:
             return None
         there = torch.cat([said1.descriptors, said1.surface])[None]
         places = modes.to(self.device).float().nan_to_num(-0.5)
-        there = sample_descriptors(there, places.flatten(0, 1)[None], sizes[1])[0].view(*modes.shape[:2], -1)
+        there = sample_descriptors(there, places.flatten(0, 1)[None], sizes[1])[0].unflatten(0, modes.shape[:2])
         channels = len(said1.descriptors)
         source = self._sample_sources(said0, xy, sizes[0])[0][:, None]  # (S, 1, D)
         logits = self.network.heads.judge(source, there[..., :channels], there[..., channels:])
@@ -277,8 +277,8 @@ class Pair:
         match = self._match(np.concatenate([points, places.astype(points.dtype)]), None)
         order = join(match.xy, mask, match.modes, match.weights, match.spread_px, places=len(places))
         weights = np.take_along_axis(match.weights, order, 1)
-        told = weights[len(points) :] if len(places) else weights
-        return sort_modes(match[: len(points)], order[: len(points), :count], told.mean(0)[:count])
+        heavy = weights[len(points) if len(places) else 0 :].sum(0) + 1e-9
+        return sort_modes(match[: len(points)], order[: len(points), :count], heavy[:count])
 
     def _find_mask(self) -> np.ndarray:
         """(H0, W0) bool, where image0 shows the object."""

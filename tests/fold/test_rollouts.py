@@ -10,6 +10,7 @@ import pytest
 
 from mmgsd.fold import rollouts
 from mmgsd.fold.demonstration import read_demonstration
+from mmgsd.fold.moves import Answer
 from mmgsd.fold.policies import POLICIES
 from mmgsd.fold.rollouts import find_on_table, list_rollouts, run_folding, summarise_rollouts
 from mmgsd.fold.tasks import GROUNDS, TASKS
@@ -46,9 +47,9 @@ def physics(monkeypatch: pytest.MonkeyPatch) -> list[str]:
                 continue
             made.append(name)
             folder.mkdir(parents=True, exist_ok=True)
-            if job["kind"] == "act":
+            if job["kind"] in ("act", "look"):
                 before = read_state(job["state"]).about
-                about = {**before, "look": before["look"] + 1, "mark": job["mark"]}
+                about = {**before, "look": before["look"] + 1, "mark": job["mark"], "again": job.get("again", 0)}
             else:
                 about = {key: job[key] for key in ("object", "task", "start", "ground", "seed")}
                 about |= {"fault": "", "look": 0, "mark": job["mark"], "thickness": 0.0}
@@ -144,3 +145,27 @@ def test_a_summary_tells_all_from_what_was_reachable() -> None:
     }
     assert said["edge"]["error"]["mean"] == pytest.approx(0.155) and said["faults"] == 1
     assert said["rollouts"]["c"] == [1.0, False]
+
+
+def test_a_policy_that_is_unsure_looks_again_and_keeps_the_surest_look(
+    tmp_path: Path, physics: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shares = {"": 0.4, "-look1": 0.6, "-look2": 0.5}
+    policy = POLICIES["mmgsd_again"]
+
+    def say(bench: rollouts.Bench, *asked: object) -> Answer:
+        look = asked[3].about.get("again", 0)
+        return Answer(np.zeros((0, 2, 2)), None, shares[f"-look{look}" if look else ""])
+
+    monkeypatch.setattr(rollouts.Bench, "_ask", say)
+    bench = rollouts.Bench(tmp_path, {"progress": False})
+    kept = [rollout for rollout in list_rollouts("cloth", 8) if rollout.task == "edge"][:1]
+    rows = bench.roll([policy, POLICIES["mmgsd"]], kept, bench.make_starts(kept))
+    assert [row["share"] for row in rows["mmgsd_again"].values()] == [0.6]
+    assert [row["share"] for row in rows["mmgsd"].values()] == [0.4]
+    ((file, answer),) = bench.acted[policy, kept[0]]
+    assert file.stem.endswith("look1") and answer.share == 0.6
+    shares[""] = 0.8  # sure at once
+    bench = rollouts.Bench(tmp_path / "sure", {"progress": False})
+    bench.roll([policy], kept, bench.make_starts(kept))
+    assert not any("look" in path.stem for path in (tmp_path / "sure" / "acts").iterdir())

@@ -8,7 +8,7 @@ from scipy.ndimage import distance_transform_edt
 
 from mmgsd.files import DamagedFileError
 from mmgsd.fold.tasks import TASKS
-from mmgsd.scene.folding import act_job, demonstration_job, read_state, run_jobs, start_job, true_moves
+from mmgsd.scene.folding import act_job, demonstration_job, look_job, read_state, run_jobs, start_job, true_moves
 from mmgsd.scene.state import write_state
 
 bpy = pytest.importorskip("bpy")
@@ -42,6 +42,7 @@ def acted(first, tmp_path_factory):
         demonstrated = read_state(first[f"demonstrated-{name}"]).points
         moves = true_moves(TASKS[name].looks[0], demonstrated, read_state(first[name]))
         jobs[name] = act_job(first[name], moves)
+    jobs["looked"] = look_job(first["edge"], 1)
     files = run(jobs, tmp_path_factory.mktemp("acted"))
     return {name: read_state(path) for name, path in files.items()}
 
@@ -71,6 +72,15 @@ def test_a_pick_beside_the_object_grasps_nothing(first, acted, name, after):
     assert np.linalg.norm(after.points - before.points, axis=1).max() < 0.03
     different = (np.abs(after.image.astype(int) - before.image).max(-1) > 40).mean()
     assert different < 0.02  # the same ground, light and materials
+
+
+def test_another_look_shows_the_same_state_from_elsewhere(first, acted):
+    before, after = read_state(first["edge"]), acted["looked"]
+    np.testing.assert_array_equal(after.points, before.points)
+    assert np.abs(after.camera_pose - before.camera_pose).max() > 0.01 and (after.image != before.image).any()
+    inside = after.visible & (after.xy > 1).all(1)
+    column, row = np.rint(after.xy[inside]).astype(int).T
+    assert after.mask[row, column].mean() > 0.85
 
 
 def test_points_are_where_the_picture_shows_them(first):
@@ -133,6 +143,8 @@ def test_jobs_refuse_what_no_task_has(first):
         start_job(dataclasses.replace(TASKS["edge"], name="iron"), "flat", "plain", 0)
     with pytest.raises(ValueError, match="moves must be pairs of finite pixels"):
         act_job(first["edge"], [((0.0, np.nan), (1.0, 1.0))])
+    with pytest.raises(ValueError, match="again must be at least 1"):
+        look_job(first["edge"], 0)
 
 
 def test_an_act_is_marked_by_the_state_that_it_goes_on_from(first):
