@@ -85,6 +85,8 @@ def _add_match(match: argparse.ArgumentParser) -> None:
     match.add_argument("--xy", type=_parse_pixel, action="append", required=True, metavar="X,Y",
                        help="column,row px in image0, the top left one is 0,0; may be given several times")  # fmt: skip
     match.add_argument("--n", type=_parse_number, metavar="N", help="modes, or auto; default: as many as its symmetry")
+    match.add_argument("--joint", action="store_true",
+                       help="answer all pixels together: the modes of one number belong together")  # fmt: skip
     for name in ("mask0", "mask1"):
         match.add_argument(f"--{name}", type=Path, metavar="FILE",
                            help=f"an image as large as image{name[-1]}, brighter than half on the object")  # fmt: skip
@@ -99,6 +101,9 @@ def _add_fold(fold: argparse.ArgumentParser) -> None:
     fold.add_argument("demonstration", type=Path, metavar="DEMO.json", help="see docs/folding.md")
     fold.add_argument("image", type=Path, help="a picture of the present state")
     fold.add_argument("--look", type=int, default=0, help="which of the demonstration's looks (default: 0, the first)")
+    fold.add_argument("--chosen", default="agree", choices=("agree", "best", "joint"),
+                      help="which like modes are taken: those that one motion agrees with (the default), each pixel's "
+                      "surest, or the surest that belong together")  # fmt: skip
     fold.add_argument("--intrinsics", type=_parse_intrinsics, metavar="FX,FY,CX,CY", help="px; prints rays too")
     fold.add_argument("--out", type=_parse_picture, metavar="FILE", help="draw the moves (png, jpg, pdf or svg)")
     fold.add_argument("--json", action="store_true", help="print the answer as JSON")

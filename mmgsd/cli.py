@@ -43,7 +43,7 @@ def match(args: argparse.Namespace) -> None:
     images = [mmgsd.read_image(path) for path in (args.image0, args.image1)]
     files = {"mask0": args.mask0, "mask1": args.mask1}
     masks = {k: f and read_mask(f, im.shape[:2]) for (k, f), im in zip(files.items(), images, strict=True)}
-    answer = mmgsd.load(args.weights).match(*images, args.xy, n=args.n, **masks)
+    answer = mmgsd.load(args.weights).match(*images, args.xy, n=args.n, joint=args.joint, **masks)
     described = describe_answer(answer)
     if args.out:
         draw_answer(answer, args.out)
@@ -67,7 +67,7 @@ def _match_folder(args: argparse.Namespace) -> None:
     matcher.compute_input_size(image0, "image0")
     bar = tqdm(paths, desc="match", unit="image", disable=not sys.stderr.isatty())
     named, frames = itertools.tee(_read_readable(matcher, bar, failed))
-    answers = matcher.match_many(((image0, image1, args.xy) for _, image1 in frames), n=args.n)
+    answers = matcher.match_many(((image0, image1, args.xy) for _, image1 in frames), n=args.n, joint=args.joint)
     with _writing_rows(args.csv) if args.csv else nullcontext() as table:
         for (path, _), answer in zip(named, answers, strict=True):
             described = describe_answer(answer)
@@ -108,7 +108,8 @@ def _list_rows(name: str, described: list[dict[str, Any]]) -> Iterator[dict[str,
         shared |= {"image1": name, **dict(zip("xy", query["xy"], strict=True))}
         for k, mode in enumerate(query["modes"]):
             x1, y1 = mode["xy"]
-            yield {**shared, "mode": k + 1, "x1": x1, "y1": y1, **{n: v for n, v in mode.items() if n != "xy"}}
+            told = {name: value for name, value in mode.items() if name not in ("xy", "answer")}
+            yield {**shared, "mode": mode.get("answer", k + 1), "x1": x1, "y1": y1, **told}
 
 
 @contextmanager
@@ -230,7 +231,7 @@ def fold(args: argparse.Namespace) -> None:
     demonstration, image = read_demonstration(args.demonstration), mmgsd.read_image(args.image)
     if args.out and args.out.resolve() == args.image.resolve():
         raise ValueError(f"--out must not be the image itself, got {args.out}")
-    answer = answer_picture(mmgsd.load(args.weights), demonstration, image, look=args.look)
+    answer = answer_picture(mmgsd.load(args.weights), demonstration, image, look=args.look, chosen=args.chosen)
     if args.out:
         draw_moves(demonstration.looks[args.look], image, answer.moves, args.out)
     moves = [{"pick": pick, "place": place} for pick, place in answer.moves.round(1).tolist()]

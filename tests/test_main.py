@@ -149,6 +149,15 @@ def test_a_mask_tells_where_the_object_is(weights, images, masks, capsys):
     assert "background" in off["said"]
 
 
+def test_pixels_are_answered_together(images, masks, capsys, tmp_path):
+    asked = ["match", *images, "--xy", "10,20", "--xy", "30,60", "--weights", "cloth", "--mask0", masks[0]]
+    asked += ["--joint", "--csv", tmp_path / "answers.csv", "--json"]
+    queries = json.loads(run(capsys, *asked))
+    assert [[mode["answer"] for mode in query["modes"]] for query in queries] == [[1, 2, 3, 4]] * 2
+    rows = (tmp_path / "answers.csv").read_text().splitlines()
+    assert [row.split(",")[3] for row in rows[1:]] == ["1", "2", "3", "4"] * 2
+
+
 @pytest.mark.parametrize(
     ("fill", "size", "message"),
     [

@@ -5,10 +5,12 @@ const PATIENCE_MS = 60000; // then the kernel is taken for gone, and the next cl
 const PART_BYTES = 4 << 20; // of a file a message: Jupyter's servers close the connection at 10 MiB
 const MOST_BYTES = 100 << 20;
 const RESTING_SHARE = 0.68; // of the window's height, for the pictures
+const TOGETHER = "One turn or flip of the object for all points, of the answers beside (a; b for the next)";
 const PARTS = { heatmap: "h", modes: "m", "true matches": "t" };
 const HELP = [["click, drag", "ask"], ["shift + click", "pin"], ["ctrl + wheel", "zoom"], ["alt + drag", "move"],
   ["p", "previous"], ["r", "random"], ["n", "next"], ["h", "heatmap"], ["m", "modes"], ["t", "true matches"],
   ["v", "move or ask"], ["+", "closer"], ["-", "farther"], ["0", "fit"], ["c", "clear"], ["f", "full screen"],
+  ["a", "points together"], ["b", "next answer"],
   ["s", "save picture"], ["j", "save JSON"],
   ["k", "save marks"]];
 
@@ -22,6 +24,7 @@ class Explorer {
     this.seen = null; // the pair whose pictures are on the screen
     this.shown = new Set(Object.keys(PARTS));
     this.moving = false;
+    this.chosen = 0; // which of the answers that belong together is drawn in full
     this.build();
     this.connect();
     this.open();
@@ -36,6 +39,8 @@ class Explorer {
       this.toggles[part] = button(part, `Show or hide (${key})`, () => this.toggle(part));
     }
     this.count = make("span", { className: "mmgsd-count" });
+    this.joiner = button("together", TOGETHER, () => this.join());
+    this.answers = make("select", { ariaLabel: "answer", title: "Which answer is drawn in full, the others faint" });
     const step = (to, key) => button(to, `Another pair (${key})`, () => this.send({ do: "step", to }));
     this.mover = button("move", "Drag moves the picture and the wheel zooms (v)", () => this.setMoving(!this.moving));
     this.pictures = ["left", "right"].map((word, side) => new Picture(word, (files) => this.upload(files, side)));
@@ -49,6 +54,7 @@ class Explorer {
       make("div", { className: "mmgsd-bar" },
         group(make("span", { className: "mmgsd-word", textContent: "method" }), this.method),
         group(...Object.values(this.toggles)),
+        group(this.joiner, this.answers),
         group(step("previous", "p"), step("random", "r"), step("next", "n"), this.count)),
       make("div", { className: "mmgsd-bar" },
         group(this.mover,
@@ -65,10 +71,11 @@ class Explorer {
 
   connect() {
     this.listening = [["change:pair", () => this.open()], ["change:answer", () => this.update()],
-      ["change:method", () => this.update()], ["change:methods", () => this.update()],
+      ["change:method", () => this.update()], ["change:together", () => this.update()], ["change:methods", () => this.update()],
       ["msg:custom", (told) => this.hear(told)]];
     this.listening.forEach(([name, act]) => this.model.on(name, act));
     this.method.onchange = () => this.send({ do: "method", name: this.method.value });
+    this.answers.onchange = () => this.choose(this.answers.selectedIndex);
     this.box.addEventListener("keydown", (event) => this.onKey(event));
     this.pictures.forEach((picture, side) => {
       picture.canvas.addEventListener("pointerdown", (event) => this.onPointer(picture, side, event));
@@ -125,6 +132,12 @@ class Explorer {
     if (this.queries.length) this.say(`${this.method.selectedOptions[0]?.textContent} answered in ${milliseconds} ms`);
     for (const node of [this.clearer, this.savers[1]]) node.disabled = !this.queries.length;
     this.toggles["true matches"].disabled = !this.seen?.truth;
+    const joint = this.answer.joint ?? [];
+    this.chosen = joint.length ? this.chosen % joint.length : 0;
+    const name = (weight, k) => make("option", { textContent: `answer ${k + 1}, ${(100 * weight).toFixed(0)} %` });
+    this.answers.replaceChildren(...joint.map(name));
+    this.answers.hidden = !joint.length;
+    this.answers.selectedIndex = joint.length ? this.chosen : -1;
     this.tables.replaceChildren(...this.queries.map((query, k) => this.makeTable(query, k)));
     this.draw();
   }
@@ -213,6 +226,7 @@ class Explorer {
       p: step("previous"), r: step("random"), n: step("next"), v: () => this.setMoving(!this.moving),
       "+": () => this.zoom(1.5), "=": () => this.zoom(1.5), "-": () => this.zoom(1 / 1.5), 0: () => this.fit(),
       c: () => this.send({ do: "clear" }), f: () => this.toggleScreen(),
+      a: () => this.join(), b: () => this.choose(this.chosen + 1),
       s: () => this.savePicture(), j: () => this.saveJson(), k: () => this.saveMarks(),
       ...Object.fromEntries(Object.entries(PARTS).map(([part, key]) => [key, () => this.toggle(part)])),
     }[event.key.toLowerCase()];
@@ -225,6 +239,15 @@ class Explorer {
   toggle(part) {
     if (!this.shown.delete(part)) this.shown.add(part);
     this.draw();
+  }
+
+  join() { // all points under one member of the symmetry, or each by itself
+    this.send({ do: "together", on: !this.model.get("together") });
+  }
+
+  choose(answer) {
+    this.chosen = answer;
+    this.update();
   }
 
   setMoving(moving) {
@@ -251,6 +274,7 @@ class Explorer {
 
   draw() {
     this.mover.setAttribute("aria-pressed", this.moving);
+    this.joiner.setAttribute("aria-pressed", this.model.get("together"));
     for (const [part, node] of Object.entries(this.toggles)) node.setAttribute("aria-pressed", this.shown.has(part));
     if (!this.seen) return;
     const width = this.pictures[0].canvas.clientWidth;
@@ -273,7 +297,8 @@ class Explorer {
       if (side === 0) return drawPixel(context, place, unit, colour, xy);
       const thick = (m) => (this.lit?.[0] === k && this.lit[1] === m ? 2 * unit : unit);
       if (this.shown.has("modes")) {
-        const how = (m) => ({ hidden: isHidden(modes[m]), faint: said });
+        const other = (m) => modes[m].answer !== undefined && modes[m].answer !== this.chosen + 1;
+        const how = (m) => ({ hidden: isHidden(modes[m]), faint: said || other(m) });
         ellipses.forEach((mode, m) => drawMode(context, place, thick(m), colour, mode, modes[m].weight, how(m)));
       }
       if (this.shown.has("true matches")) matches.forEach((match) => drawCross(context, place, unit, colour, match));
@@ -290,7 +315,7 @@ class Explorer {
       const [x, y] = mode.xy.map((value) => value.toFixed(1));
       const spread = `± ${mode.spread_px.toFixed(0)} px`;
       const seen = mode.visible === undefined ? [] : [`${isHidden(mode) ? "hidden" : "seen"}, ${percent(mode.visible)}`];
-      const node = row("td", [[dot(), `${m + 1}`], x, y, share(mode.weight), spread, share(mode.confidence), ...seen]);
+      const node = row("td", [[dot(), `${mode.answer ?? m + 1}`], x, y, share(mode.weight), spread, share(mode.confidence), ...seen]);
       const light = (lit) => () => {
         this.lit = lit;
         this.draw();

@@ -51,6 +51,7 @@ class Pictures(anywidget.AnyWidget):
     answer = traitlets.Dict().tag(sync=True)  # pair, number, milliseconds, json, points, heat, heat_size
     methods = traitlets.List().tag(sync=True)  # [name, label] of each
     method = traitlets.Unicode().tag(sync=True)
+    together = traitlets.Bool(False).tag(sync=True)  # whether all points are answered under one member of the symmetry
     heat_colours = traitlets.Bytes((255 * HEAT).astype(np.uint8).tobytes()).tag(sync=True)  # 256 times R, G, B
 
     def __repr__(self) -> str:
@@ -117,6 +118,20 @@ class Explorer:
             raise
 
     @property
+    def together(self) -> bool:
+        """Whether all points are answered together (`Matcher.match`, ``joint``); setting it is as setting `method`."""
+        return self.pictures.together
+
+    @together.setter
+    def together(self, on: bool) -> None:
+        before, self.pictures.together = self.pictures.together, bool(on)
+        try:
+            self._answer(self.points)
+        except Exception:
+            self.pictures.together = before
+            raise
+
+    @property
     def points(self) -> list[tuple[float, float]]:
         """The pixels that are asked about: the pinned ones first."""
         return [*self.pins, *([] if self.xy is None else [self.xy])]
@@ -148,7 +163,7 @@ class Explorer:
         """Have the chosen method answer for all points, and the browser draw what it says."""
         start, match = time.perf_counter(), None
         if points:
-            match = self._get_answering()(np.array(points))
+            match = self._get_answering()(np.array(points), joint=self.together)
         shown = {"json": "[]", "points": []} if match is None else show_answer(match, self.scene)
         self.milliseconds = 1000 * (time.perf_counter() - start)
         self.answers += 1
@@ -156,7 +171,7 @@ class Explorer:
         self.answer, self.pictures.answer = match, about | shown
         return match
 
-    def _get_answering(self) -> Callable[[np.ndarray], Match]:
+    def _get_answering(self) -> Callable[..., Match]:
         """The chosen method, its descriptors of this pair computed once."""
         name = self.method
         if name not in self._prepared:
@@ -188,12 +203,14 @@ class Explorer:
             self._step(content["to"])
         elif do == "method":
             self.method = content["name"]
+        elif do == "together":
+            self.together = content["on"]
         elif do == "clear":
             self.clear()
         elif do == "file":
             self._receive(content, buffers)
         else:
-            raise ValueError(f"do must be ask, step, method, clear or file, got {do!r}")
+            raise ValueError(f"do must be ask, step, method, together, clear or file, got {do!r}")
 
     def _step(self, to: str) -> None:
         count = len(self.scenes)
@@ -223,7 +240,8 @@ def show_scene(scene: Scene) -> dict[str, Any]:
 def show_answer(match: Match, scene: Scene) -> dict[str, Any]:
     """What the browser is told of an answer: ``json`` as of ``python -m mmgsd match --json``, and what is drawn.
 
-    ``points`` {ellipses, matches} of each query, see `describe_ellipses`, px; ``heat`` of the last one, 0 to 255.
+    ``points`` {ellipses, matches} of each query, see `describe_ellipses`, px; ``heat`` of the last one, 0 to 255;
+    ``joint`` of answers that belong together how much each weighs, or [].
     """
     height, width = scene.image1.shape[:2]
     scale = HEAT_PX / max(width, height)
@@ -233,7 +251,8 @@ def show_answer(match: Match, scene: Scene) -> dict[str, Any]:
     truth = (scene.find_truth(xy).tolist() for xy in match.xy)
     points = [{"ellipses": shapes, "matches": true} for shapes, true in zip(ellipses, truth, strict=True)]
     shown = {"heat": np.rint(255 * heat).astype(np.uint8).tobytes(), "heat_size": list(size)}
-    return shown | {"json": json.dumps(describe_answer(match)), "points": points}
+    joint = [] if match.joint is None else match.joint.astype(float).round(4).tolist()
+    return shown | {"json": json.dumps(describe_answer(match)), "points": points, "joint": joint}
 
 
 def describe_ellipses(match: Match, query: int = 0) -> list[dict[str, float]]:
@@ -245,7 +264,7 @@ def describe_ellipses(match: Match, query: int = 0) -> list[dict[str, float]]:
     return described
 
 
-def prepare_baseline(matcher: FeatureMatcher, scene: Scene) -> Callable[[np.ndarray], Match]:
+def prepare_baseline(matcher: FeatureMatcher, scene: Scene) -> Callable[..., Match]:
     """Answers of baselines, which see large images made smaller; pixels (S, 2) are those of the large."""
     small = [_shrink(image, BASELINE_PX) for image in (scene.image0, scene.image1)]
     size = (small[1].shape[1], small[1].shape[0])
@@ -255,7 +274,9 @@ def prepare_baseline(matcher: FeatureMatcher, scene: Scene) -> Callable[[np.ndar
         for image, less in zip((scene.image0, scene.image1), small, strict=True)
     )
 
-    def answer(xy: np.ndarray) -> Match:
+    def answer(xy: np.ndarray, *, joint: bool = False) -> Match:
+        if joint:
+            raise ValueError("together must be off for this method: trained weights alone answer points together")
         found = matcher.match(*small, (xy + 0.5) / ratio0 - 0.5, mask1=mask)
         back = {
             "modes": (found.modes + 0.5) * ratio1 - 0.5,

@@ -15,7 +15,8 @@ def describe_answer(match: Match) -> list[dict[str, Any]]:
     """A `Match` as plain values, a dictionary a query: px, shares, nats.
 
     ``visible`` of a mode, ``on_object``, ``absent`` and ``said``, which is "" or why there is no answer
-    (`say_presence`), only where they are known.
+    (`say_presence`), only where they are known. Of a joint answer each mode has its ``answer``, from 1 on: those of one
+    number belong together.
     """
     confidence, described = match.confidence(), []
     for query, xy in enumerate(match.xy):
@@ -35,6 +36,8 @@ def _describe_mode(match: Match, query: int, k: int, confidence: np.ndarray) -> 
         "spread_px": round(float(match.spread_px[query, k]), 2),
         "confidence": round(float(confidence[query, k]), 4),
     }
+    if match.joint is not None:
+        mode["answer"] = int(k) + 1
     return mode if match.visible is None else {**mode, "visible": round(float(match.visible[query, k]), 4)}
 
 

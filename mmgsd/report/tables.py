@@ -14,6 +14,7 @@ from mmgsd.files import write_text
 from mmgsd.report import descriptions as described
 from mmgsd.report.findings import describe_claims, make_findings
 from mmgsd.report.folding import make_folding_sentence, make_folding_table
+from mmgsd.report.joint import make_joint_sentence, make_joint_table
 from mmgsd.report.results import load_results, read_table, told_where
 from mmgsd.report.shipped import (
     make_budget_sentence,
@@ -95,6 +96,8 @@ TABLES: dict[str, tuple[str | tuple[str, ...], Callable[[Any], described.Table |
     "uncertainty": ("paper/uncertainty.json", described.describe_uncertainty),
     "folding": ("quick/folding.json", make_folding_table),
     "folding_counts": ("quick/folding.json", make_folding_sentence),
+    "joint": ("joint.json", make_joint_table),
+    "joint_counts": ("joint.json", make_joint_sentence),
     "pictures": ("shipped.json", make_pictures_table),
     "parts": ("shipped.json", make_parts_table),
     "readings": ("shipped.json", make_readings_table),

@@ -77,7 +77,13 @@ def bare(chromium: Any) -> Any:
     style = (ROOT / "mmgsd" / "extras" / "explorer.css").read_text()
     chromium.set_content("<body></body>")
     chromium.add_style_tag(content=style)
-    state = {"pair": make_pair(1), "answer": {}, "methods": [["mmgsd", "MMGSD"], ["spcl", HOSTILE]], "method": "mmgsd"}
+    state = {
+        "pair": make_pair(1),
+        "answer": {},
+        "methods": [["mmgsd", "MMGSD"], ["spcl", HOSTILE]],
+        "method": "mmgsd",
+        "together": False,
+    }
     colours = base64.b64encode(bytes(768)).decode()
     chromium.evaluate(STAND_IN, [script, {**state, "marks": "[]", "heat_colours": {"base64": colours}}])
     chromium.get_by_text("left 1").wait_for()
@@ -115,6 +121,30 @@ def test_what_is_hidden_or_absent_is_said(bare: Any) -> None:
     show(bare, "answer", answer)
     assert bare.locator(".mmgsd-why").count() == 0
     assert (look(bare) != faint).any()
+
+
+def test_answers_that_belong_together_are_chosen_one_at_a_time(bare: Any) -> None:
+    answers = bare.get_by_label("answer", exact=True)
+    assert answers.is_hidden()
+    bare.get_by_role("button", name="together").click()
+    assert read_sent(bare)[-1] | {"token": ""} == {"do": "together", "on": True, "token": ""}
+    answer = make_answer(1, (40, 50), (60, 50))
+    queries = json.loads(answer["json"])
+    for query, point in zip(queries, answer["points"], strict=True):
+        query["modes"] = [{**query["modes"][0], "answer": k + 1, "xy": [150.0 - 80 * k, 50.0]} for k in (0, 1)]
+        point["ellipses"] = [{**point["ellipses"][0], "x": mode["xy"][0]} for mode in query["modes"]]
+    bare.evaluate("() => window.kernel.keep('together', true)")
+    show(bare, "answer", {**answer, "json": json.dumps(queries), "joint": [0.6, 0.4]})
+    assert bare.get_by_role("button", name="together").get_attribute("aria-pressed") == "true"
+    assert answers.locator("option").all_inner_texts() == ["answer 1, 60 %", "answer 2, 40 %"]
+    first = look(bare)
+    answers.select_option("answer 2, 40 %")
+    second = look(bare)
+    assert (second != first).any()
+    bare.locator(".mmgsd-explorer").press("b")
+    np.testing.assert_array_equal(look(bare), first)
+    show(bare, "answer", make_answer(1, (40, 50)))
+    assert answers.is_hidden()
 
 
 def test_pinned_points_are_saved_as_marks(bare: Any) -> None:

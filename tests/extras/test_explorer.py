@@ -13,6 +13,7 @@ import pytest
 import torch
 from PIL import Image
 
+import mmgsd
 from mmgsd.config import TrainConfig
 from mmgsd.dataset import load_dataset
 from mmgsd.extras.explorer import DISPLAY_PX, MOST_PINS, Explorer, prepare_baseline, show_scene
@@ -219,9 +220,25 @@ def test_another_method_answers_for_the_same_points(explorer: Explorer) -> None:
     assert explorer.answer.xy.tolist() == [[240, 200]] and not np.allclose(explorer.answer.modes, trained)
 
 
+def test_points_are_answered_together_where_the_weights_can(explorer: Explorer) -> None:
+    tell(explorer, "ask", xy=[240, 200], pin=True)
+    assert "mask0" in tell(explorer, "together", on=True)  # an untrained network knows no mask
+    assert explorer.pictures.together is explorer.together is False and explorer.pictures.answer["joint"] == []
+    images = explorer.scene.image0, explorer.scene.image1
+    explorer._prepared["mmgsd"] = mmgsd.load("cloth").prepare(*images).match
+    assert tell(explorer, "together", on=True) is None
+    assert tell(explorer, "ask", xy=[200, 240], pin=True) is None
+    sent = explorer.pictures.answer
+    assert len(sent["joint"]) == 4 and sum(sent["joint"]) == pytest.approx(1, abs=1e-3)
+    assert [[mode["answer"] for mode in query["modes"]] for query in json.loads(sent["json"])] == [[1, 2, 3, 4]] * 2
+    assert "together must be off for this method" in tell(explorer, "method", name="sift")
+    assert explorer.method == "mmgsd" and tell(explorer, "together", on=False) is None
+    assert "answer" not in json.loads(explorer.pictures.answer["json"])[0]["modes"][0]
+
+
 def test_a_method_that_fails_is_not_taken(explorer: Explorer) -> None:
     explorer.ask(240, 200)
-    explorer._prepared["sift"] = lambda xy: 1 / 0
+    explorer._prepared["sift"] = lambda xy, **_: 1 / 0
     assert "ZeroDivisionError" in tell(explorer, "method", name="sift")
     assert explorer.pictures.method == "mmgsd" and explorer.answer is not None
     assert "must be one of 'mmgsd', 'sift'" in tell(explorer, "method", name="dino")

@@ -1,0 +1,127 @@
+"""Do the answers to several pixels belong together? Questions of three random points, answered jointly and one by one.
+
+    python -m mmgsd.measure.joint cloth rope            of shipped weights -> data/results/joint.json
+
+The test images of the presets `SETS` have to be rendered. A question is right where one member of the symmetry takes
+all its points to within `RADIUS_PX` of the chosen modes. Answers are chosen four ways: each point's heaviest mode; the
+best choice that the modes allow, for which one has to know the truth; the first joint answer (`mmgsd.match.joint`); and
+all joint answers, of which the share that is right counts.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import statistics
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mmgsd.command import run_command
+from mmgsd.config import DEFAULT_GROUP, EvaluateConfig
+from mmgsd.dataset import Dataset, load_dataset
+from mmgsd.learn.training import name_hardware
+from mmgsd.match.match import RADIUS_PX, Match
+from mmgsd.match.matcher import Matcher, find_weights
+from mmgsd.measure.evaluation import read_results, write_results
+from mmgsd.measure.questions import draw_pairs
+from mmgsd.paths import Paths, find_root
+from mmgsd.progress import ProgressBar
+
+SETS = ("paper", "workspace")  # presets whose test images are asked about
+PAIRS, QUESTIONS, POINTS = 200, 3, 3  # pairs of images, questions about each, points of a question
+CHOSEN = ("heaviest", "possible", "joint", "any_joint")  # shares of right questions
+SWAPS = ("swaps_heaviest", "swaps_joint")  # shares of two right points of a question that belong to two members
+RESULTS = "joint.json"
+
+
+def measure_joint(name: str, root: Path, *, pairs: int = PAIRS, progress: bool = True) -> dict[str, Any]:
+    """The row of shipped weights: of each of `SETS` `summarise_questions`, of all and by the second image's state.
+
+    And how many milliseconds a joint answer takes and one that is not, the median over the pairs. FileNotFoundError
+    where weights or images are missing.
+    """
+    file = find_weights(name)
+    matcher = Matcher.load(file)
+    row: dict[str, Any] = {"object": matcher.object, "sha256": hashlib.sha256(file.read_bytes()).hexdigest()}
+    seconds: dict[bool, list[float]] = {True: [], False: []}
+    for preset in SETS:
+        data = load_dataset(Paths(root, preset).dataset(matcher.object), "test")
+        found: dict[str, list[dict[str, float]]] = {"all": []}
+        drawn, rng = draw_pairs(data, EvaluateConfig(pairs=pairs)), np.random.default_rng(0)
+        for first, second in ProgressBar(drawn, desc=f"{name}, {preset}", unit="pair", disable=not progress):
+            seen = np.flatnonzero(data.visible[first])
+            if len(seen) < QUESTIONS * POINTS:
+                continue
+            points = rng.choice(seen, QUESTIONS * POINTS, replace=False)
+            images, matches = (data.load_image(first), data.load_image(second)), {}
+            for joint in (False, True):
+                begun = time.perf_counter()
+                matches[joint] = matcher.match(*images, data.xy[first][points], joint=joint)
+                seconds[joint].append(time.perf_counter() - begun)
+            asked = judge_questions(data, second, points, matches[False], matches[True])
+            found["all"] += asked
+            found.setdefault(str(data.labels.state[second]), []).extend(asked)
+        row[preset] = {kind: summarise_questions(asked) for kind, asked in sorted(found.items())}
+    took = {joint: round(1000 * statistics.median(values)) for joint, values in seconds.items()}
+    return row | {
+        "milliseconds": {"joint": took[True], "alone": took[False]},
+        "hardware": name_hardware(matcher.device),
+    }
+
+
+def judge_questions(
+    data: Dataset, second: int, points: np.ndarray, alone: Match, joint: Match
+) -> list[dict[str, float]]:
+    """Of each question of `POINTS` of material ``points`` (S,), whether the ways of `CHOSEN` are right; its swaps.
+
+    A measure that a question has not, NaN: swaps of fewer than two points that are right each by itself.
+    """
+    members = np.array(data.group(DEFAULT_GROUP.get(data.object, "")).permutations)[:, points]
+    true = data.xy[second][members].astype(float)  # (G, S, 2)
+    near = {name: np.linalg.norm(match.modes[None] - true[:, :, None], axis=-1) < RADIUS_PX  # (G, S, n)
+            for name, match in (("alone", alone), ("joint", joint))}  # fmt: skip
+    rows = []
+    for start in range(0, len(points), POINTS):
+        one, all_ = (near[name][:, start : start + POINTS] for name in ("alone", "joint"))
+        rows.append({"heaviest": float(one[:, :, 0].all(1).any()),
+                     "possible": float(one.any(2).all(1).any()),
+                     "joint": float(all_[:, :, 0].all(1).any()),
+                     "any_joint": float(all_.all(1).any(0).mean()),
+                     "swaps_heaviest": _measure_swaps(one[:, :, 0]),
+                     "swaps_joint": _measure_swaps(all_[:, :, 0])})  # fmt: skip
+    return rows
+
+
+def _measure_swaps(near: np.ndarray) -> float:
+    """Of pairs of points that are right (G, S) each by itself, the share that no member explains together."""
+    right = np.flatnonzero(near.any(0))
+    pairs = [(i, j) for i in right for j in right if i < j]
+    return float(np.mean([not (near[:, i] & near[:, j]).any() for i, j in pairs])) if pairs else float("nan")
+
+
+def summarise_questions(asked: list[dict[str, float]]) -> dict[str, float]:
+    """{measure: mean over questions, "questions": how many}; None where no question has the measure."""
+    said: dict[str, Any] = {"questions": len(asked)}
+    for name in (*CHOSEN, *SWAPS):
+        values = np.array([row[name] for row in asked], float)
+        known = values[np.isfinite(values)]
+        said[name] = round(float(known.mean()), 4) if len(known) else None
+    return said
+
+
+def main() -> None:
+    """Measure shipped weights, a row each; rows of other names stay."""
+    parser = argparse.ArgumentParser(prog="python -m mmgsd.measure.joint", description=__doc__.split("\n")[0])
+    parser.add_argument("names", nargs="+", help="of weights in data/weights, or files")
+    names, root = parser.parse_args().names, find_root()
+    out = root / "data" / "results" / RESULTS
+    for name in names:
+        write_results(read_results(out) | {name: measure_joint(name, root)}, out)
+    print(f"{out}: {', '.join(names)}")
+
+
+if __name__ == "__main__":
+    run_command(main, kept="rows of weights that are finished are kept")
