@@ -1,6 +1,6 @@
 """The bench: rollouts of every policy from the same first states, as files, and what came of them.
 
-    python -m mmgsd.fold.rollouts quick         -> data/results/quick/folding.json, figures/quick/folding.jpg, .webp
+    python -m mmgsd.fold.rollouts quick         -> data/results/quick/folding.json, figures/quick/folding*
     python -m mmgsd.fold.rollouts quick --only mmgsd       those policies whose name holds that text
     python -m mmgsd.fold.rollouts demonstrations           -> data/demonstrations, what policies are shown
 
@@ -20,7 +20,7 @@ import numpy as np
 from mmgsd.checks import check_choice
 from mmgsd.command import run_command
 from mmgsd.config import DEFAULT_GROUP, OBJECTS
-from mmgsd.figures.folding import mark_moves, plot_rollouts, save_slides
+from mmgsd.figures.folding import mark_moves, plot_rollouts, plot_success, save_slides
 from mmgsd.figures.style import save_figure
 from mmgsd.files import DamagedFileError, read_json, set_aside, write_json
 from mmgsd.fold.agreement import Motion
@@ -100,7 +100,10 @@ def run_folding(
     save_figure(plot_rollouts(pictures), paths.figures / "folding", kinds=("jpg",))
     if slides:
         save_slides(slides, paths.figures / "folding.webp")
-    return write_json(out, {"run": {"rollouts": ROLLOUTS[preset]}, "policies": rows})
+    results = {"run": {"rollouts": ROLLOUTS[preset]}, "policies": rows}
+    if any("reachable" in row for policies_ in rows.values() for row in policies_.values()):
+        save_figure(plot_success(results), paths.figures / "folding_success", kinds=("png",))
+    return write_json(out, results)
 
 
 def write_demonstrations(root: Path, *, workers: int = 0, scheduler: str = "", progress: bool = True) -> list[Path]:

@@ -12,6 +12,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from scipy import stats
+
 from mmgsd.config import OBJECTS
 from mmgsd.experiments import MODELS, UNTRAINED, get_label
 from mmgsd.report.claims import get
@@ -192,15 +194,29 @@ def describe_places(results: Results) -> Table:
 
 
 def describe_seeds(results: Results) -> Table:
-    """The mean and the std of the RMSE over seeds, from {object: {"mmgsd-0": errors}}, a method a row."""
-    seeds = {label: {name: say_seeds(results.get(name, {}), method) for name in OBJECTS}
+    """The mean and the std of the RMSE over seeds, from {object: {"mmgsd-0": errors}}, a method a row.
+
+    Marked by an asterisk where it differs from MMGSD's: Welch's t-test, p < 0.05.
+    """
+    seeds = {label: {name: _mark_apart(results.get(name, {}), method) for name in OBJECTS}
              for method, label in LABELS.items()}  # fmt: skip
     return _describe_objects("RMSE px: mean ± std (seeds)", {k: row for k, row in seeds.items() if any(row.values())})
 
 
+def _mark_apart(rows: Results, method: str) -> str | None:
+    said, values, ours = say_seeds(rows, method), _list_seeds(rows, method), _list_seeds(rows, "mmgsd")
+    if min(len(values), len(ours)) < 2 or method == "mmgsd":
+        return said
+    return f"{said} *" if stats.ttest_ind(values, ours, equal_var=False).pvalue < 0.05 else said
+
+
+def _list_seeds(rows: Results, method: str) -> list[float]:
+    return [row["rmse_mean"] for key, row in rows.items() if key.rpartition("-")[0] == method]
+
+
 def say_seeds(rows: Results, method: str) -> str | None:
     """Mean, std of the sample, and how many: "54.6 ± 0.8 (3)"; no std of one, None of none."""
-    values = [row["rmse_mean"] for key, row in rows.items() if key.rpartition("-")[0] == method]
+    values = _list_seeds(rows, method)
     if len(values) < 2:
         return f"{values[0]:.1f} (1)" if values else None
     return f"{statistics.mean(values):.1f} ± {statistics.stdev(values):.1f} ({len(values)})"

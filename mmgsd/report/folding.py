@@ -10,7 +10,8 @@ from mmgsd.fold.policies import POLICIES
 
 Results = Mapping[str, Any]  # data/results/<preset>/folding.json
 HEADS = ("success", "error", "overlap", "error of all")
-COMPARED = {"mmgsd_best": "each pixel's surest mode", "spcl": "SPCL"}  # with MMGSD's agreeing modes
+COMPARED = {"mmgsd_again": "looking again if unsure", "mmgsd_joint": "the surest joint answer",
+            "mmgsd_best": "each pixel's surest mode", "spcl": "SPCL"}  # with MMGSD's agreeing modes  # fmt: skip
 
 
 def make_folding_table(results: Results) -> str:
@@ -31,7 +32,7 @@ def make_folding_table(results: Results) -> str:
 
 
 def make_folding_sentence(results: Results) -> str:
-    """How many rollouts count, what caution brings, and how much farther off than MMGSD others end."""
+    """How many rollouts count, what caution brings, and the difference of others' errors from that of MMGSD's."""
     said = [f"{object.capitalize()}: {_say_object(results['policies'][object])}" for object in OBJECTS]
     return f"{'. '.join(said)}."
 
@@ -46,8 +47,8 @@ def _say_object(rows: Mapping[str, Any]) -> str:
     for name, label in COMPARED.items():
         more = rows.get(name, {}).get("beyond", {"error": {"count": 0}})["error"]
         if more["count"]:
-            mean, low, high = (f"{100 * more[key]:.1f}" for key in ("mean", "low", "high"))
-            parts.append(f"{label} ends {mean} points ({low} to {high}) farther off than MMGSD")
+            mean, low, high = (f"{100 * more[key]:+.1f}".replace("-", "−") for key in ("mean", "low", "high"))
+            parts.append(f"{mean} points ({low} to {high}) of error by {label}")
     return "; ".join(parts)
 
 

@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mmgsd.figures.folding import THUMBNAIL_PX, crop_square, mark_moves, plot_moves, plot_rollouts, save_slides
+from mmgsd.figures.folding import (
+    THUMBNAIL_PX,
+    crop_square,
+    mark_moves,
+    plot_moves,
+    plot_rollouts,
+    plot_success,
+    save_slides,
+)
 
 PICTURE = np.zeros((48, 64, 3), np.uint8)
 
@@ -56,3 +64,17 @@ def test_slides_hold_pairs_with_their_moves(tmp_path: Path) -> None:
         assert slides.n_frames == 2 and slides.width == 2 * slides.height
     with pytest.raises(ValueError, match="slides must not be empty"):
         save_slides([], path)
+
+
+def test_success_has_a_dot_with_its_interval_for_what_was_measured() -> None:
+    def row(low: float, mean: float, high: float) -> dict:
+        return {"reachable": {"success": {"mean": mean, "low": low, "high": high, "count": 7}}}
+
+    policies = {"cloth": {"truth": row(1, 1, 1), "mmgsd": row(0.5, 0.75, 0.9)}, "rope": {"truth": row(1, 1, 1)}}
+    figure = plot_success({"policies": policies})
+    cloth, rope = figure.axes
+    assert [tick.get_text() for tick in cloth.get_yticklabels()] == ["true matches", "MMGSD, modes that agree"]
+    assert [len(axis.containers) for axis in (cloth, rope)] == [2, 1]
+    assert cloth.get_title() == "Cloth, 7 rollouts" and cloth.containers[1].lines[0].get_xdata().tolist() == [75.0]
+    with pytest.raises(ValueError, match="results"):
+        plot_success({"policies": {"cloth": {}, "rope": {}}})

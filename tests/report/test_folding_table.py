@@ -35,8 +35,8 @@ def test_counts_caution_and_pairs_are_said() -> None:
     results = {**RESULTS, "policies": {**RESULTS["policies"]}}
     results["policies"]["cloth"] = {**results["policies"]["cloth"], "spcl": row(0.5)}
     assert make_folding_sentence(results) == (
-        "Cloth: 8 of 10 rollouts count; MMGSD succeeds in 90 % of the 5 whose modes agree most; SPCL ends 20.0 points "
-        "(10.0 to 30.0) farther off than MMGSD. Rope: 8 of 10 rollouts count."
+        "Cloth: 8 of 10 rollouts count; MMGSD succeeds in 90 % of the 5 whose modes agree most; +20.0 points "
+        "(+10.0 to +30.0) of error by SPCL. Rope: 8 of 10 rollouts count."
     )
 
 

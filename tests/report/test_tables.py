@@ -103,6 +103,13 @@ def test_seeds_are_a_mean_and_a_std() -> None:
                                      "| PCL | – | 70.0 (1) |"]  # fmt: skip
 
 
+def test_what_seeds_tell_apart_from_mmgsd_is_marked() -> None:
+    errors = {"mmgsd": (50.0, 51.0, 52.0), "spcl": (60.0, 61.0, 62.5), "pcl": (49.0, 53.0, 58.0)}
+    cloth = {f"{name}-{seed}": {"rmse_mean": e} for name, found in errors.items() for seed, e in enumerate(found)}
+    rows = {line.split(" | ")[0]: line.split(" | ")[1] for line in read_page("seeds", {"cloth": cloth})[2:]}
+    assert rows == {"| **MMGSD** (ours)": "51.0 ± 1.0 (3)", "| SPCL": "61.2 ± 1.3 (3) *", "| PCL": "53.3 ± 4.5 (3)"}
+
+
 def test_a_group_has_its_errors_by_place() -> None:
     regions = {region: {"rmse_px": 10.0 * i} for i, region in enumerate(("corner", "edge", "interior"), start=1)}
     table = read_page("symmetry", {"c4": {"rmse_mean": 15.04, "regions": regions}})
