@@ -34,6 +34,7 @@ REPEATS = {  # claim: what repeats it, and the models of runs.json that it train
     "entropy": ("`06_uncertainty`", ("mmgsd",)),
     "inward": ("`08_symmetry_study`", ()),
     "group": ("`08_symmetry_study`", ()),
+    "surest": ("`.venv/bin/python -m mmgsd.fold.rollouts paper`", ()),
 }
 
 

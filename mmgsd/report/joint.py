@@ -13,11 +13,13 @@ HEADS = {"heaviest": "right: heaviest modes", "joint": "first joint answer", "an
 
 
 def make_joint_table(rows: Mapping[str, Mapping[str, Any]]) -> str:
-    """Markdown: shares of questions that are right, and of swaps, a row an object, set and state of image1."""
+    """Markdown: shares of questions that are right, and of swaps, a row an object and set, of clean images by image1's state."""
     lines = ["|  | " + " | ".join(HEADS.values()) + " |", "|---" * (len(HEADS) + 1) + "|"]
     for row in rows.values():
         for preset, word in SETS.items():
             for kind, said in row.get(preset, {}).items():
+                if kind != "all" and preset != next(iter(SETS)):
+                    continue  # of clean images alone
                 label = f"{row['object']}, {word}" if kind == "all" else f"{row['object']}, {word}, {kind}"
                 lines.append(f"| {label} | " + " | ".join(_say(said[name]) for name in HEADS) + " |")
     return "\n".join(lines)

@@ -36,12 +36,22 @@ def told_where(path: Path) -> Iterator[None]:
 
 
 def load_results(folder: Path) -> dict[str, Any]:
-    """{name: content} of the results files that are there, and ``places`` where the figures' data are."""
+    """{name: content} of the results files that are there; ``folding`` in short, ``places`` from the figures' data."""
     files = {name: folder / f"{name}.json" for name in FILES}
     results = {name: read_table(path) for name, path in files.items() if path.is_file()}
     drawn = {name: folder / f"figures_{name}.safetensors" for name in OBJECTS}
     places = {name: measure_places(path, name) for name, path in drawn.items() if path.is_file()}
-    return results | ({"places": places} if places else {})
+    rollouts = folder / "folding.json"
+    folding = {"folding": read_folding(rollouts)} if rollouts.is_file() else {}
+    return results | folding | ({"places": places} if places else {})
+
+
+def read_folding(path: Path) -> dict[str, dict[str, Any]]:
+    """{object: {policy: its ``error``, ``success`` and ``overlap`` where rollouts count, and ``beyond`` MMGSD's}}."""
+    with told_where(path):
+        return {object: {name: {**row["reachable"], "beyond": row["beyond"]}
+                         for name, row in policies.items() if "reachable" in row and "beyond" in row}
+                for object, policies in read_table(path)["policies"].items()}  # fmt: skip
 
 
 def measure_places(path: Path, name: str) -> dict[str, float]:

@@ -8,12 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mmgsd.files import write_json
 from mmgsd.fold import rollouts
 from mmgsd.fold.demonstration import read_demonstration
 from mmgsd.fold.moves import Answer
 from mmgsd.fold.policies import POLICIES
 from mmgsd.fold.rollouts import find_on_table, list_rollouts, run_folding, summarise_rollouts
 from mmgsd.fold.tasks import GROUNDS, TASKS
+from mmgsd.report.results import load_results
 from mmgsd.scene.state import State, read_state, write_state
 
 ASKED = [POLICIES["truth"], POLICIES["random"]]
@@ -96,6 +98,14 @@ def test_a_rollout_that_is_a_success_untouched_does_not_count(tmp_path: Path, ph
     results = json.loads(run_folding("smoke", tmp_path, policies=ASKED, progress=False).read_text())
     rows = results["policies"]["cloth"]  # nothing moves, and the demonstration's end is its start
     assert rows["truth"]["all"]["success"]["mean"] == 1 and "reachable" not in rows["truth"]
+
+
+def test_the_report_reads_what_a_run_wrote(tmp_path: Path) -> None:
+    said = {"mean": 0.5, "low": 0.1, "high": 0.9, "count": 4}
+    row = {"reachable": {"success": said}, "beyond": {"error": said}, "all": {}, "rollouts": {"a": [0.1, True]}}
+    write_json(tmp_path / "folding.json", {"run": {}, "policies": {"cloth": {"mmgsd": row, "sift": {}}, "rope": {}}})
+    folding = load_results(tmp_path)["folding"]
+    assert folding == {"cloth": {"mmgsd": {"success": said, "beyond": {"error": said}}}, "rope": {}}
 
 
 def test_slides_show_each_look_and_the_end(tmp_path: Path, physics: list[str]) -> None:

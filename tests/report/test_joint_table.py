@@ -6,7 +6,7 @@ from mmgsd.report.joint import make_joint_sentence, make_joint_table
 
 SAID = {"questions": 6, "heaviest": 0.02, "possible": 0.5, "joint": 0.4, "any_joint": 0.35, "swaps_heaviest": 0.8,
         "swaps_joint": None}  # fmt: skip
-ROWS = {"cloth": {"object": "cloth", "paper": {"all": SAID, "folded": SAID}, "workspace": {"all": SAID},
+ROWS = {"cloth": {"object": "cloth", "paper": {"all": SAID, "folded": SAID}, "workspace": {"all": SAID, "folded": SAID},
                   "milliseconds": {"joint": 220, "alone": 90}, "hardware": "CPU, 1 of 2 cores"}}  # fmt: skip
 
 

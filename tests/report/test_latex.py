@@ -58,7 +58,9 @@ def make_results() -> dict:
             "temperature 1": {name: {"mmgsd": {**uncertainty, "coverage@90%": 0.5}} for name in OBJECTS},
         },
         "places": {"cloth": {"corner": 20.0, "edge": 25.0, "interior": 35.0}, "rope": {"end": 20.0, "middle": 40.0}},
-    }
+        "folding": {name: {"mmgsd_best": {"success": {"mean": 0.8}, "beyond": {"error": {"low": -0.01}}}}
+                    for name in OBJECTS},
+    }  # fmt: skip
 
 
 def judge_all(results: dict) -> dict[str, str]:
@@ -111,6 +113,7 @@ def test_every_claim_can_hold() -> None:
         ("inward", ("symmetry", "c4", "regions", "interior", "entropy"), 3.0, NOT_HELD),
         ("group", ("symmetry", "v4", "regions", "interior", "rmse_px"), 32.0, IN_PART),
         ("group", ("symmetry", "v4", "regions", "corner", "rmse_px"), 50.0, NOT_HELD),  # worse everywhere
+        ("surest", ("folding", "rope", "mmgsd_best", "beyond", "error", "low"), 0.01, IN_PART),
     ],
 )
 def test_one_number_changes_the_verdict(key: str, path: tuple[str, ...], value: float, verdict: str) -> None:
@@ -133,6 +136,8 @@ def test_no_claim_holds_where_all_is_otherwise() -> None:
         metrics |= {"rmse_mean": 50.0, "pck@20px": 0.9, "right": 0.5}
     for row in results["symmetry"].values():
         row["regions"] = {r: {"rmse_px": 30.0, "entropy": 9.0} for r in REGIONS}
+    for rows in results["folding"].values():
+        rows["mmgsd_best"]["beyond"]["error"]["low"] = 0.1
     assert set(judge_all(results).values()) == {NOT_HELD}
 
 
