@@ -13,7 +13,7 @@ HEADS = {"heaviest": "right: heaviest modes", "joint": "first joint answer", "an
 
 
 def make_joint_table(rows: Mapping[str, Mapping[str, Any]]) -> str:
-    """Markdown: shares of questions that are right, and of swaps, a row an object and set, of clean images by image1's state."""
+    """Markdown: shares of right questions and of swaps, a row an object and set, clean ones by image1's state."""
     lines = ["|  | " + " | ".join(HEADS.values()) + " |", "|---" * (len(HEADS) + 1) + "|"]
     for row in rows.values():
         for preset, word in SETS.items():
