@@ -82,6 +82,18 @@ def test_a_rope_s_halves_are_told_apart_where_its_maps_cross(rng: np.random.Gene
     assert count_right(order[clear], shuffled[clear]) > 0.9
 
 
+def test_a_shirt_and_its_mirror_image_are_told_apart(rng: np.random.Generator) -> None:
+    mask = np.zeros((260, 260), bool)
+    mask[60:110, 20:240] = True  # sleeves
+    mask[60:240, 80:180] = True
+    xy = spread_places(mask)
+    mirrored = np.stack([259 - xy[:, 0], xy[:, 1]], 1)  # both maps are one along the middle
+    turn = np.array([[0.8, -0.6], [0.6, 0.8]])
+    modes, shuffled = shuffle(np.stack([xy, mirrored], 1) @ turn + 300, rng)
+    order, clear = sort(xy, modes, mask, len(xy)), np.abs(xy[:, 0] - 129.5) > 15
+    assert count_right(order[clear], shuffled[clear]) > 0.9
+
+
 def test_parts_that_nothing_joins_are_sorted_too(rng: np.random.Generator) -> None:
     mask = MASK.copy()
     mask[:, 120:140] = False  # a gripper in front
