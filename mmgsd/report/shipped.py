@@ -98,6 +98,19 @@ def make_sources_sentence(rows: Rows) -> str:
     return SOURCES.format(sources=", ".join(f"`{name}`" for name in sources))
 
 
+def make_by_source_table(rows: Rows) -> str:
+    """Markdown of the photographs of each public repository, a row each: what the shipped weights find in them."""
+    lines = ["|  | questions | unanswered | found | at 10 % | spurious | best |", "|---" * 7 + "|"]
+    for object in OBJECTS:
+        for name, said in rows[object]["photographs"]["sources"].items():
+            shares = [
+                _format(said, key, 100, ".0f", " %") for key in ("unanswered", "found@5%", "found@10%", "spurious")
+            ]
+            asked, best = _format(said, "queries", 1, "d"), _format(said, "best", 1, ".1f", " %")
+            lines.append(_join([f"{object}, `{name}`", asked, *shares, best]))
+    return "\n".join(lines)
+
+
 def make_counts_sentence(rows: Rows) -> str:
     """How many photographs were asked about, and how long a question takes."""
     counts = " and ".join(f"{rows[object]['photographs']['photographs']} of {object}s" for object in OBJECTS)

@@ -18,6 +18,7 @@ from mmgsd.report.joint import make_joint_sentence, make_joint_table
 from mmgsd.report.results import load_results, read_table, told_where
 from mmgsd.report.shipped import (
     make_budget_sentence,
+    make_by_source_table,
     make_counts_sentence,
     make_knowledge_table,
     make_parts_table,
@@ -104,6 +105,7 @@ TABLES: dict[str, tuple[str | tuple[str, ...], Callable[[Any], described.Table |
     "budget_of_parts": ("shipped.json", make_budget_sentence),
     "knowledge": ("shipped.json", make_knowledge_table),
     "sources": ("shipped.json", make_sources_sentence),
+    "by_source": ("shipped.json", make_by_source_table),
     "counts": ("shipped.json", make_counts_sentence),
 }
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from mmgsd.report.shipped import (
     list_names,
     make_budget_sentence,
+    make_by_source_table,
     make_counts_sentence,
     make_knowledge_table,
     make_parts_table,
@@ -77,3 +78,13 @@ def test_sentences_name_the_sources_and_count_the_photographs() -> None:
     assert make_sources_sentence(ROWS).endswith("The photographs are from `a/b`, `c/d`.")
     said = "Photographs: 34 of cloths and 32 of ropes. One question about two new images takes 140 ms (CPU, 2 cores)."
     assert make_counts_sentence(ROWS) == said
+
+
+def test_each_repository_is_a_row_and_what_it_lacks_a_dash() -> None:
+    found = {"queries": 12, "unanswered": 0.2, "found@5%": 0.4477, "found@10%": 0.83, "spurious": 0.3, "best": 11.96}
+    rows = {"cloth": {"photographs": {"sources": {"a/b": found}}}, "rope": {"photographs": {"sources": {"c/d": {}}}}}
+    lines = make_by_source_table(rows).splitlines()
+    assert lines[2:] == [
+        "| cloth, `a/b` | 12 | 20 % | 45 % | 83 % | 30 % | 12.0 % |",
+        "| rope, `c/d` | – | – | – | – | – | – |",
+    ]
