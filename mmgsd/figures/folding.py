@@ -19,7 +19,7 @@ from mmgsd.files import writing
 from mmgsd.fold.policies import POLICIES
 
 THUMBNAIL_PX = 160  # sides of a picture
-WRAPPED = 13  # letters of a line beside or above such a picture
+WRAPPED, ACROSS = 13, 120  # letters of a line beside such a picture, and of the lines above a row of them
 SLIDE_PX, SLIDE_MS = 300, 1400  # sides of a slide's pictures, and how long it is shown
 PANEL_IN = 2.4  # width of a picture with moves
 
@@ -90,7 +90,7 @@ def plot_rollouts(pictures: Mapping[str, Mapping[str, np.ndarray]]) -> Figure:
             axis.spines[:].set_visible(False)
         line[0].set_ylabel(fill(task, WRAPPED), fontsize=6)
     for axis, shown in zip(axes[0], columns, strict=True):
-        axis.set_title(fill(shown, WRAPPED), fontsize=6)
+        axis.set_title(fill(shown, max(6, ACROSS // len(columns))), fontsize=6)
     plt.close(figure)  # a notebook shows what a cell returns; an open figure would appear twice
     return figure
 

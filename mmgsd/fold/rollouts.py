@@ -214,7 +214,8 @@ class Bench:
                 "its end": shown[-1].image,
                 "found": read_state(starts[rollout]).image,
             }
-            rows[task.label] = row | {policy.label: read_state(self.ends[policy, rollout]).image for policy in policies}
+            seen = [policy for policy in policies if policy.looks == 1]  # what looks again mostly does the same
+            rows[task.label] = row | {policy.label: read_state(self.ends[policy, rollout]).image for policy in seen}
         return rows
 
     def list_slides(self, policy: Policy, rollouts: list[Rollout]) -> list[tuple[np.ndarray, np.ndarray]]:
