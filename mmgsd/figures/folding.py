@@ -90,7 +90,7 @@ def plot_rollouts(pictures: Mapping[str, Mapping[str, np.ndarray]]) -> Figure:
             axis.spines[:].set_visible(False)
         line[0].set_ylabel(fill(task, WRAPPED), fontsize=6)
     for axis, shown in zip(axes[0], columns, strict=True):
-        axis.set_title(fill(shown, max(6, ACROSS // len(columns))), fontsize=6)
+        axis.set_title(fill(shown, max(6, ACROSS // len(columns)), break_long_words=False), fontsize=6)
     plt.close(figure)  # a notebook shows what a cell returns; an open figure would appear twice
     return figure
 
