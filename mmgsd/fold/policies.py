@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mmgsd.checks import check_choice
-from mmgsd.config import DEFAULT_GROUP
+from mmgsd.config import DEFAULT_GROUP, load_preset
+from mmgsd.experiments import configure_model, get_colour
 from mmgsd.fold.demonstration import Look
 from mmgsd.fold.moves import AGREE, BEST, JOINT
+from mmgsd.learn.checkpoints import WEIGHTS
 from mmgsd.match.baselines import BaselineMatcher
 from mmgsd.match.match import Match
 from mmgsd.match.matcher import Matcher, find_weights
+from mmgsd.paths import Paths, find_root
 from mmgsd.symmetry import load_group
 
+TRAINED_BY = "quick"  # preset whose models of an equal, small budget are compared
 VERSION = 3  # to be raised where a policy answers the same question otherwise than before
 
 
@@ -30,6 +35,8 @@ class Policy:
     colour: str
     matcher: str = ""  # what follows the object in the name of shipped weights ("" with ``chosen``), or a baseline
     chosen: str = ""
+    # instead of shipped weights: the row of the main table that the preset `TRAINED_BY` trained
+    trained: str = field(default="", repr=False)  # the weights themselves are what an answer depends on
     looks: int = 1  # where few of its modes agree, it looks so often, each time from elsewhere, before it acts
 
 
@@ -38,15 +45,20 @@ POLICIES = {
     for policy in (
         Policy("truth", "true matches", "#404040"),
         Policy("mmgsd", "MMGSD, modes that agree", "#D55E00", "", AGREE),
-        Policy("mmgsd_again", "the same, looks again if unsure", "#8A3500", "", AGREE, 3),
+        Policy("mmgsd_again", "the same, looks again if unsure", "#8A3500", "", AGREE, looks=3),
         Policy("mmgsd_joint", "MMGSD, surest joint answer", "#F0A070", "", JOINT),
         Policy("mmgsd_best", "MMGSD, each pixel's surest", "#A6761D", "", BEST),
         Policy("spcl", "SPCL, modes that agree", "#0072B2", "-spcl", AGREE),
         Policy("daisy", "DAISY, modes that agree", "#E69F00", "daisy", AGREE),
         Policy("sift", "SIFT, modes that agree", "#CC79A7", "sift", AGREE),
+        *(Policy(f"quick_{name}", f"{label}, as `{TRAINED_BY}` trains it", get_colour(name), "", AGREE, name)
+          for name, label in (("mmgsd", "MMGSD"), ("spcl", "SPCL"), ("unimodal", "Unimodal"), ("pcl", "PCL"))),
         Policy("random", "random points", "#9A9A9A"),
     )
-}
+}  # fmt: skip
+
+
+SHIPPED = tuple(policy for policy in POLICIES.values() if not policy.trained)
 
 
 def find_policy(name: str) -> Policy:
@@ -60,13 +72,24 @@ def load_matcher(policy: Policy, object: str) -> Any:
     """What answers a policy's questions about an object."""
     if policy.matcher.isalpha():
         return BaselineMatcher(policy.matcher, modes=load_group(object, DEFAULT_GROUP[object]).order)
-    return Matcher.load(find_weights(object + policy.matcher))
+    return Matcher.load(find_answering(policy, object))
+
+
+def find_answering(policy: Policy, object: str) -> Path:
+    """The file of weights that answers; FileNotFoundError for a model that is not trained yet."""
+    if not policy.trained:
+        return find_weights(object + policy.matcher)
+    model = configure_model(load_preset(TRAINED_BY), object, policy.trained)
+    path = Paths(find_root(), TRAINED_BY).model(model) / WEIGHTS
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} is not there: `make reproduce` trains the models of the preset {TRAINED_BY}")
+    return path
 
 
 @cache
 def digest_policy(policy: Policy, object: str) -> str:
     """What a policy's answers depend on beside the pictures and the demonstration."""
-    weights = "" if policy.matcher.isalpha() or not policy.chosen else find_weights(object + policy.matcher)
+    weights = "" if policy.matcher.isalpha() or not policy.chosen else find_answering(policy, object)
     content = weights.read_bytes() if weights else b""
     return hashlib.sha256(repr((VERSION, policy)).encode() + content).hexdigest()[:16]
 

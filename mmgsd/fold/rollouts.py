@@ -2,6 +2,7 @@
 
     python -m mmgsd.fold.rollouts quick         -> data/results/quick/folding.json, figures/quick/folding*
     python -m mmgsd.fold.rollouts quick --only mmgsd       those policies whose name holds that text
+    python -m mmgsd.fold.rollouts quick --trained          the four methods as the preset quick trains them
     python -m mmgsd.fold.rollouts demonstrations           -> data/demonstrations, what policies are shown
 
 All go in step: first states, every policy's answers, what physics makes of them, the next look. A killed run goes on.
@@ -27,7 +28,7 @@ from mmgsd.fold.agreement import Motion
 from mmgsd.fold.demonstration import Demonstration, Look, write_demonstration
 from mmgsd.fold.measures import SIDES_M, SUCCESS, compare_rollouts, estimate_mean, measure_outcome
 from mmgsd.fold.moves import Answer, choose_moves
-from mmgsd.fold.policies import POLICIES, Policy, ask, digest_policy, draw_moves
+from mmgsd.fold.policies import POLICIES, SHIPPED, TRAINED_BY, Policy, ask, digest_policy, draw_moves
 from mmgsd.fold.tasks import GROUNDS, TASKS, Task
 from mmgsd.match.camera import compute_rays
 from mmgsd.paths import Paths, find_root
@@ -67,10 +68,12 @@ def list_rollouts(object: str, count: int) -> list[Rollout]:
 
 
 def run_folding(
-    preset: str, root: Path, *, policies: Iterable[Policy] = tuple(POLICIES.values()), workers: int = 0,
+    preset: str, root: Path, *, policies: Iterable[Policy] = SHIPPED, workers: int = 0,
     scheduler: str = "", progress: bool = True,
 ) -> Path:  # fmt: skip
     """Run a preset's rollouts of some policies, write what came of them, and draw one of each task; the results' path.
+
+    What is drawn are these policies, where `REFERENCE` is one of them.
 
     ``workers`` and ``scheduler`` are as `run_jobs` has them.
 
@@ -97,8 +100,8 @@ def run_folding(
             ours = rows[object][REFERENCE]["rollouts"]
             for row in rows[object].values():
                 row["beyond"] = compare_rollouts(ours, row["rollouts"], reachable)
-    save_figure(plot_rollouts(pictures), paths.figures / "folding", kinds=("jpg",))
     if slides:
+        save_figure(plot_rollouts(pictures), paths.figures / "folding", kinds=("jpg",))
         save_slides(slides, paths.figures / "folding.webp")
     results = {"run": {"rollouts": ROLLOUTS[preset]}, "policies": rows}
     if any("reachable" in row for policies_ in rows.values() for row in policies_.values()):
@@ -317,6 +320,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m mmgsd.fold.rollouts", description=__doc__.split("\n")[0])
     parser.add_argument("preset", choices=(*ROLLOUTS, DEMONSTRATIONS))
     parser.add_argument("--only", default="", help="policies whose name holds this text; their rows alone are written")
+    parser.add_argument("--trained", action="store_true",
+                        help=f"instead the four methods' models that the preset {TRAINED_BY} trained")  # fmt: skip
     parser.add_argument("--workers", type=int, default=0, help="child processes at once (default: one a core)")
     parser.add_argument("--scheduler", default="", help="address of a Dask scheduler; none: this machine")
     args = parser.parse_args()
@@ -326,9 +331,12 @@ def main() -> None:
         how = {"workers": args.workers, "scheduler": args.scheduler}
         print("\n".join(map(str, write_demonstrations(find_root(), **how))))
         return
-    policies = [policy for policy in POLICIES.values() if args.only in policy.name or policy.name == "truth"]
-    if not any(args.only in policy.name for policy in policies):
-        parser.error(f"--only {args.only!r}: no policy has a name with that; there are {', '.join(POLICIES)}")
+    asked = [policy for policy in POLICIES.values() if bool(policy.trained) == args.trained]
+    policies = [POLICIES["truth"], *(p for p in asked if args.only in p.name and p.name != "truth")]
+    if not any(args.only in policy.name for policy in asked):
+        parser.error(
+            f"--only {args.only!r}: no policy has a name with that; there are {', '.join(p.name for p in asked)}"
+        )
     print(run_folding(args.preset, find_root(), policies=policies, workers=args.workers, scheduler=args.scheduler))
 
 
