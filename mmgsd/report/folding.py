@@ -10,7 +10,7 @@ from mmgsd.fold.policies import POLICIES
 
 Results = Mapping[str, Any]  # data/results/<preset>/folding.json
 HEADS = ("success", "error", "overlap", "error of all")
-COMPARED = {"mmgsd_again": "looking again if unsure", "mmgsd_joint": "the surest joint answer",
+COMPARED = {"mmgsd_joint": "the surest joint answer",
             "mmgsd_best": "each pixel's surest mode", "spcl": "SPCL"}  # with MMGSD's agreeing modes  # fmt: skip
 
 

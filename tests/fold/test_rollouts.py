@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from mmgsd.files import write_json
-from mmgsd.fold import rollouts
+from mmgsd.fold import policies, rollouts
 from mmgsd.fold.demonstration import read_demonstration
 from mmgsd.fold.moves import Answer
-from mmgsd.fold.policies import POLICIES
+from mmgsd.fold.policies import POLICIES, SHIPPED, digest_policy, find_answering
 from mmgsd.fold.rollouts import find_on_table, list_rollouts, run_folding, summarise_rollouts
 from mmgsd.fold.tasks import GROUNDS, TASKS
 from mmgsd.report.results import load_results
@@ -128,6 +128,34 @@ def test_rows_of_other_policies_stay(tmp_path: Path, physics: list[str]) -> None
     run_folding("smoke", tmp_path, policies=ASKED, progress=False)
     results = json.loads(run_folding("smoke", tmp_path, policies=ASKED[:1], progress=False).read_text())
     assert list(results["policies"]["rope"]) == ["truth", "random"]
+
+
+def test_a_model_that_is_not_trained_yet_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MMGSD_ROOT", str(tmp_path))
+    policy = POLICIES["quick_pcl"]
+    with pytest.raises(FileNotFoundError, match="cloth-pcl-.*weights.safetensors is not there: `make reproduce`"):
+        find_answering(policy, "cloth")
+    weights = find_answering(POLICIES["spcl"], "cloth")
+    assert weights.name == "cloth-spcl.safetensors" and policy not in SHIPPED
+    monkeypatch.setattr(policies, "find_answering", lambda *_: weights)
+    digest_policy.cache_clear()
+    assert digest_policy(policy, "cloth") != digest_policy(POLICIES["quick_spcl"], "cloth")
+    digest_policy.cache_clear()
+
+
+@pytest.mark.parametrize(("words", "names"), [
+    ([], {"truth", "mmgsd", "spcl", "random"}),
+    (["--trained"], {"truth", "quick_mmgsd", "quick_unimodal"}),
+    (["--trained", "--only", "pcl"], {"truth", "quick_spcl", "quick_pcl"}),
+])  # fmt: skip
+def test_the_command_runs_shipped_weights_or_trained_models(
+    words: list[str], names: set[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[set[str]] = []
+    monkeypatch.setattr(rollouts, "run_folding", lambda *_, policies, **__: asked.append({p.name for p in policies}))
+    monkeypatch.setattr("sys.argv", ["rollouts", "smoke", *words])
+    rollouts.main()
+    assert names <= asked[0] and any("quick" in name for name in asked[0]) == ("--trained" in words)
 
 
 def test_another_preset_has_no_rollouts(tmp_path: Path) -> None:
