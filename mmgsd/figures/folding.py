@@ -64,7 +64,7 @@ def plot_success(results: Mapping[str, Any]) -> Figure:
                               color=POLICIES[name].colour)  # fmt: skip
         counted = rows[object].get("truth", {}).get("reachable", {}).get("success", {}).get("count", 0)
         axis.set(title=f"{object.capitalize()}, {counted} rollouts", xlabel="Success (%)", xlim=(-4, 104))
-    axes[0].set_yticks(range(len(names)), [POLICIES[name].label for name in names])
+    axes[0].set_yticks(range(len(names)), [POLICIES[name].label.replace("`", "") for name in names])
     axes[0].invert_yaxis()
     return finish_axes(figure)
 
