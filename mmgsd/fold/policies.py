@@ -37,6 +37,7 @@ class Policy:
     chosen: str = ""
     # instead of shipped weights: the row of the main table that the preset `TRAINED_BY` trained
     trained: str = field(default="", repr=False)  # the weights themselves are what an answer depends on
+    one: bool = field(default=False, repr=False)  # answers with one mode, as what learnt one match a pixel does
     looks: int = 1  # where few of its modes agree, it looks so often, each time from elsewhere, before it acts
 
 
@@ -53,6 +54,8 @@ POLICIES = {
         Policy("sift", "SIFT, modes that agree", "#CC79A7", "sift", AGREE),
         *(Policy(f"quick_{name}", f"{label}, as `{TRAINED_BY}` trains it", get_colour(name), "", AGREE, name)
           for name, label in (("mmgsd", "MMGSD"), ("spcl", "SPCL"), ("unimodal", "Unimodal"), ("pcl", "PCL"))),
+        Policy("quick_one", f"Unimodal, as `{TRAINED_BY}` trains it, one mode", get_colour("unimodal"), "", AGREE,
+               "unimodal", one=True),
         Policy("random", "random points", "#9A9A9A"),
     )
 }  # fmt: skip
@@ -95,10 +98,13 @@ def digest_policy(policy: Policy, object: str) -> str:
 
 
 def ask(policy: Policy, object: str, look: Look, image: np.ndarray, mask: np.ndarray) -> Match:
-    """The matches of a look's picks and anchors in an image; baselines are told the object's ``mask`` (H, W) bool."""
-    matcher = load_matcher(policy, object)
+    """The matches of a look's picks and anchors in an image; baselines are told the object's ``mask`` (H, W) bool.
+
+    As many modes as the symmetry has members are asked for, also of methods that learnt one match a pixel.
+    """
+    matcher, order = load_matcher(policy, object), load_group(object, DEFAULT_GROUP[object]).order
     told = {"mask1": mask} if isinstance(matcher, BaselineMatcher) else {"joint": policy.chosen == JOINT}
-    return matcher.match(look.image, image, look.asked, **told)
+    return matcher.match(look.image, image, look.asked, n=1 if policy.one else order, **told)
 
 
 def draw_moves(look: Look, mask: np.ndarray, rng: np.random.Generator) -> np.ndarray:
