@@ -10,7 +10,7 @@ import pytest
 
 from mmgsd.files import write_json
 from mmgsd.fold import policies, rollouts
-from mmgsd.fold.demonstration import read_demonstration
+from mmgsd.fold.demonstration import Look, read_demonstration
 from mmgsd.fold.moves import Answer
 from mmgsd.fold.policies import POLICIES, SHIPPED, digest_policy, find_answering
 from mmgsd.fold.rollouts import find_on_table, list_rollouts, run_folding, summarise_rollouts
@@ -141,6 +141,27 @@ def test_a_model_that_is_not_trained_yet_is_named(tmp_path: Path, monkeypatch: p
     digest_policy.cache_clear()
     assert digest_policy(policy, "cloth") != digest_policy(POLICIES["quick_spcl"], "cloth")
     digest_policy.cache_clear()
+
+
+@pytest.mark.parametrize(("name", "object", "told"), [
+    ("mmgsd", "cloth", {"n": 4, "joint": False}),
+    ("mmgsd_joint", "rope", {"n": 2, "joint": True}),
+    ("quick_unimodal", "cloth", {"n": 4, "joint": False}),
+    ("quick_one", "cloth", {"n": 1, "joint": False}),
+])  # fmt: skip
+def test_all_methods_are_asked_for_as_many_modes_but_one(
+    name: str, object: str, told: dict, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    class Listening:
+        def match(self, *_: object, **how: object) -> None:
+            asked.append(how)
+
+    monkeypatch.setattr(policies, "load_matcher", lambda *_: Listening())
+    image = np.zeros((9, 9, 3), np.uint8)
+    policies.ask(POLICIES[name], object, Look(image, np.zeros((1, 2, 2)), np.zeros((0, 2))), image, image[..., 0] > 0)
+    assert asked == [told]
 
 
 @pytest.mark.parametrize(("words", "names"), [
