@@ -92,7 +92,6 @@ def list_assigned(source: str) -> list[str]:
 OF_NO_PRESET = ("your_images", "12_other_pictures")  # the latter shows what was measured on the images of two
 STAGES = [path.stem for path in NOTEBOOKS if path.stem[0].isdigit() and path.stem not in OF_NO_PRESET]
 SMOKE = {"preset": "smoke", "run": True}
-SHOWN = {"10_fold_by_demonstration": "quick"}  # what is not of the paper's size
 FLAGS = {
     "01_render_data": ("run", "overwrite", "only_test"), "02_inspect_data": ("run",), "03_train": ("run", "overwrite"),
     "04_evaluate": ("run", "overwrite"), "05_sigma_ablation": ("run", "overwrite"),
@@ -265,7 +264,7 @@ MISSING = [  # notebook, what it is told, what it asks for
     ("08_symmetry_study", {}, STORED + "symmetry.json yet: run 08_symmetry_study with run=True for it first"),
     ("09_error_analysis", {**SMOKE, "objects": "rope"}, "smoke/rope/dataset.json yet"),
     ("09_error_analysis", {"method": "spcl"}, STORED + "errors_spcl.json yet: run 09_error_analysis with run=True"),
-    ("10_fold_by_demonstration", {}, "quick/folding.json yet: run 10_fold_by_demonstration with run=True for it first"),
+    ("10_fold_by_demonstration", {}, "paper/folding.json yet: run 10_fold_by_demonstration with run=True for it first"),
     ("11_broken_symmetry", {}, STORED + "broken_symmetry.json yet: run 11_broken_symmetry with run=True for it first"),
 ]
 
@@ -281,8 +280,7 @@ def test_what_has_to_be_run_first_is_said(empty_root, notebook, told, said):
 def test_what_is_committed_shows_the_papers_size_and_runs_nothing(notebook):
     cells = nbformat.read(ROOT / "notebooks" / f"{notebook}.ipynb", 4).cells
     (tagged,) = (cell.source for cell in cells if "parameters" in cell.metadata.get("tags", ()))
-    size = SHOWN.get(notebook, "paper")
-    assert tagged.startswith(f'preset = "{size}"  # ') and "\nrun = False  # True " in tagged
+    assert tagged.startswith('preset = "paper"  # ') and "\nrun = False  # True " in tagged
 
 
 def test_a_point_that_a_small_preset_does_not_ask_about_is_refused(empty_root):
