@@ -12,8 +12,8 @@ from mmgsd.match.baselines import BASELINES
 Rows = Mapping[str, Mapping[str, Any]]  # data/results/shipped.json, {name: what `mmgsd.measure.shipped` found}
 SETS = {"paper": "clean", "workspace": "cluttered"}  # test images: what readers know them as
 SOURCES = """\
-`found`: marked corners or ends with a mode within a twentieth of the object's size; `spurious`: surest modes farther
-than a tenth from all; `best`: how far `match.best()` is from the nearest. The photographs are from {sources}."""
+The photographs, counted as on the
+[results page](data/results/README.md#is-it-right-about-clutter-and-photographs), are from {sources}."""
 COUNTS = "Photographs: {counts}. One question about two new images takes {slowest:.0f} ms ({hardware})."
 
 

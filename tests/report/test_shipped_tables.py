@@ -75,7 +75,7 @@ def test_knowledge_is_of_weights_alone() -> None:
 
 
 def test_sentences_name_the_sources_and_count_the_photographs() -> None:
-    assert make_sources_sentence(ROWS).endswith("The photographs are from `a/b`, `c/d`.")
+    assert make_sources_sentence(ROWS).endswith("are from `a/b`, `c/d`.")
     said = "Photographs: 34 of cloths and 32 of ropes. One question about two new images takes 140 ms (CPU, 2 cores)."
     assert make_counts_sentence(ROWS) == said
 
