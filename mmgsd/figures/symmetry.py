@@ -1,64 +1,43 @@
-"""Where on a cloth a symmetry group's errors lie: by region, and as maps."""
+"""Where on a cloth a symmetry group's errors lie: as maps, and by region."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
-import pandas as pd
 from matplotlib import colormaps
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mmgsd.config import N_POINTS
 from mmgsd.experiments import get_colour
 from mmgsd.figures.style import PAGE_IN, check_filled, finish_axes, name_grid, styled
-from mmgsd.measure.metrics import compute_point_errors
-
-SIDE = round(N_POINTS**0.5)
-CORNER, BORDER, INTERIOR = 5, 3, 13  # points: side of a corner's block, width of the edge, side of the interior
-
-
-def find_regions(side: int = SIDE) -> dict[str, np.ndarray]:
-    """Material points (side²,) bool of a cloth's ``corner`` blocks, the rest of its ``edge``, and its ``interior``."""
-    row, column = np.divmod(np.arange(side * side), side)
-    from_edge = np.stack([np.minimum(v, side - 1 - v) for v in (row, column)])
-    corner = (from_edge < CORNER).all(0)
-    edge = (from_edge < BORDER).any(0) & ~corner
-    return {"corner": corner, "edge": edge, "interior": (from_edge >= (side - INTERIOR) // 2).all(0)}
-
-
-def summarise_regions(queries: pd.DataFrame) -> dict[str, dict[str, float]]:
-    """{region: mean ``rmse_px``, mean ``entropy`` (nats) and number of queries with a visible source}."""
-    seen = queries[queries.visible]
-    summary = {}
-    for region, points in find_regions().items():
-        part = seen[points[seen.point]]
-        means = {name: float(part[name].mean()) if len(part) else None for name in ("rmse_px", "entropy")}
-        summary[region] = {**means, "queries": len(part)}
-    return summary
+from mmgsd.measure.regions import MAP, SIDE
 
 
 @styled
-def plot_symmetry_study(tables: Mapping[str, pd.DataFrame]) -> Figure:
-    """Maps of the RMSE over the cloth on one scale, ``tables`` {group: queries}, and error and entropy by region."""
-    check_filled("tables", tables)
-    ratios = [1.0] * len(tables) + [1.4, 1.4]
+def plot_symmetry_study(places: Mapping[str, Mapping[str, Any]]) -> Figure:
+    """Maps of the RMSE over the cloth on one scale, and error and entropy by region.
+
+    ``places`` {group: what `mmgsd.measure.regions.summarise_places` gives}.
+    """
+    check_filled("places", places)
+    ratios = [1.0] * len(places) + [1.4, 1.4]
     figure, axes = plt.subplots(1, len(ratios), figsize=(PAGE_IN, 1.9), layout="constrained", width_ratios=ratios)
-    maps = [compute_point_errors(table).reshape(SIDE, SIDE) for table in tables.values()]
-    for axis, group, values in zip(axes, tables, maps, strict=False):
+    maps = [np.array(row[MAP], float).reshape(SIDE, SIDE) for row in places.values()]
+    for axis, group, values in zip(axes, places, maps, strict=False):
         image = axis.imshow(values, cmap=colormaps["viridis"].with_extremes(bad="0.85"), vmin=0, vmax=np.nanmax(maps))
         axis.set_title(group)
-    name_grid(axes[: len(tables)])
-    bar = figure.colorbar(image, ax=axes[: len(tables)], shrink=0.75)
+    name_grid(axes[: len(places)])
+    bar = figure.colorbar(image, ax=axes[: len(places)], shrink=0.75)
     bar.ax.set_title("RMSE\n(px)", fontsize=7)
-    regions = {group: summarise_regions(table) for group, table in tables.items()}
     for axis, name, label in zip(axes[-2:], ("rmse_px", "entropy"), ("RMSE (px)", "Entropy (nats)"), strict=True):
-        _draw_regions(axis, {group: {r: row[name] for r, row in rows.items()} for group, rows in regions.items()})
+        _draw_regions(axis, {group: {r: row[name] for r, row in shown["regions"].items()}
+                             for group, shown in places.items()})  # fmt: skip
         axis.set_ylabel(label)
-    figure.legend(*axes[-1].get_legend_handles_labels(), loc="outside upper right", ncols=len(tables), handlelength=1)
-    return finish_axes(figure, keep_box=axes[: len(tables)])
+    figure.legend(*axes[-1].get_legend_handles_labels(), loc="outside upper right", ncols=len(places), handlelength=1)
+    return finish_axes(figure, keep_box=axes[: len(places)])
 
 
 def _draw_regions(axis: Axes, groups: Mapping[str, Mapping[str, float | None]]) -> None:

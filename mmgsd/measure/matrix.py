@@ -172,13 +172,15 @@ def write_sigma_table(preset: Preset, root: Path, sigmas_px: Sequence[float] = (
 def write_seed_table(preset: Preset, root: Path, seeds: int = 0, *, steps: int = 0) -> None:
     """Write seeds.json, by the rule of `write_tables`: of the seeds 0 to ``seeds`` - 1, and those that are there.
 
-    The models of other ``steps`` than the main table's have a file of their own: seeds_1000.json.
+    The models of other ``steps`` than the main table's have a file of their own: seeds_1000.json. Of those that the
+    study of the smaller budget has as well, its rows are taken where there are no others.
     """
     seeds, steps = read_count("seeds", seeds), read_count("steps", steps)
     paths, study = Paths(root, preset.name), f"seeds_{steps}" if steps else "seeds"
     there = _read_keys(paths.results / f"{study}.json", lambda key: int(key.rpartition("-")[2]))
     rows = vary_seed([*range(seeds), *there])
-    _write_study({name: configure_study(preset, name, "seeds", rows, steps=steps) for name in OBJECTS}, paths, study)
+    models = {name: configure_study(preset, name, "seeds", rows, steps=steps) for name in OBJECTS}
+    _write_study(models, paths, study, beside="budget")
 
 
 def _read_keys(path: Path, convert: Callable[[str], float]) -> list[float]:
@@ -191,12 +193,17 @@ def _read_keys(path: Path, convert: Callable[[str], float]) -> list[float]:
         raise DamagedFileError(f"{path} has a row of another study ({error}): restore it, or remove the row") from error
 
 
-def _write_study(models: dict[str, dict[str, TrainConfig]], paths: Paths, study: str) -> None:
-    """One file {object: {key: errors, and under "run" the cost}} of models under the same keys, where any is done."""
+def _write_study(models: dict[str, dict[str, TrainConfig]], paths: Paths, study: str, *, beside: str = "") -> None:
+    """One file {object: {key: errors, and under "run" the cost}} of models under the same keys, where any is done.
+
+    A model's row that this file lacks is that of the same model in the file ``beside``.
+    """
     stored, rows = read_results(paths.results / f"{study}.json", depth=2), {}
+    others = read_results(paths.results / f"{beside}.json", depth=2) if beside else {}
+    named = {row["run"].get("model"): row for shared in others.values() for row in shared.values() if "run" in row}
     for name, keyed in models.items():
         for key, model in keyed.items():
-            kept = stored.get(name, {}).get(key, {})
+            kept = stored.get(name, {}).get(key) or named.get(model.name, {})
             row, run = _find_row(paths, "", model, kept, kept.get("run", {}))
             if row:
                 rows.setdefault(name, {})[key] = {**row, "run": run}

@@ -11,6 +11,7 @@ import numpy as np
 
 from mmgsd.config import N_POINTS, OBJECTS
 from mmgsd.files import DamagedFileError, read_json
+from mmgsd.measure.regions import MAP
 
 REMEDY = "restore it (it may be in git), or run its notebook again with run=True"
 PAPER = {"cloth": 32.4, "rope": 31.3}  # px, MMGSD's RMSE as the paper reports it
@@ -36,9 +37,15 @@ def told_where(path: Path) -> Iterator[None]:
 
 
 def load_results(folder: Path) -> dict[str, Any]:
-    """{name: content} of the results files that are there; ``folding`` in short, ``places`` from the figures' data."""
+    """{name: content} of the results files that are there; ``folding`` in short, ``places`` from the figures' data.
+
+    Without the symmetry study's maps, which are for its figure.
+    """
     files = {name: folder / f"{name}.json" for name in FILES}
     results = {name: read_table(path) for name, path in files.items() if path.is_file()}
+    with told_where(files["symmetry"]):
+        for row in results.get("symmetry", {}).values():
+            row.pop(MAP, None)
     drawn = {name: folder / f"figures_{name}.safetensors" for name in OBJECTS}
     places = {name: measure_places(path, name) for name, path in drawn.items() if path.is_file()}
     rollouts = folder / "folding.json"
@@ -56,8 +63,8 @@ def read_folding(path: Path) -> dict[str, dict[str, Any]]:
 
 def measure_places(path: Path, name: str) -> dict[str, float]:
     """MMGSD's mean error (px) by place on the object: ``corner``, ``edge``, ``interior``, or ``end``, ``middle``."""
-    from mmgsd.figures.symmetry import find_regions
     from mmgsd.measure.figure_data import load_figure_data  # with torch: only where it is needed
+    from mmgsd.measure.regions import find_regions
 
     errors = load_figure_data(path).errors["mmgsd"]
     if name == "cloth":

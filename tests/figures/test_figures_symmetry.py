@@ -1,53 +1,21 @@
-"""The regions of a cloth, and the study's maps and bars."""
+"""The symmetry study's maps and bars."""
 
 from __future__ import annotations
 
 import numpy as np
-import pandas as pd
 import pytest
 from matplotlib.colors import to_rgba
+from queries import make_queries
 
 from mmgsd.experiments import get_colour
-from mmgsd.figures.symmetry import find_regions, plot_symmetry_study, summarise_regions
-
-
-def make_queries(corner: float, other: float, points: int = 625) -> pd.DataFrame:
-    point = np.unique(np.linspace(0, 624, points).round().astype(int))
-    errors = np.where(find_regions()["corner"][point], corner, other)
-    table = pd.DataFrame({"point": point, "visible": True, "rmse_px": errors, "entropy": errors / 10})
-    hidden = table.assign(visible=False, rmse_px=1e6)
-    return pd.concat([table, hidden], ignore_index=True)
-
-
-def test_regions_by_hand():
-    regions = find_regions()
-    assert {name: int(points.sum()) for name, points in regions.items()} == {
-        "corner": 100,
-        "edge": 180,
-        "interior": 169,
-    }
-    assert not (regions["corner"] & regions["edge"]).any() and not (regions["edge"] & regions["interior"]).any()
-    assert regions["corner"][[0, 24, 600, 624]].all() and regions["interior"][312] and regions["edge"][12]
-    for points in regions.values():  # every group of a square leaves a region where it is
-        grid = points.reshape(25, 25)
-        assert (grid == grid[::-1]).all() and (grid == grid.T).all()
-
-
-def test_regions_are_summarised_over_visible_sources():
-    summary = summarise_regions(make_queries(10.0, 30.0))
-    assert summary["corner"] == {"rmse_px": 10.0, "entropy": 1.0, "queries": 100}
-    assert summary["interior"] == {"rmse_px": 30.0, "entropy": 3.0, "queries": 169}
-
-
-def test_a_region_never_asked_has_no_mean():
-    queries = make_queries(10.0, 30.0)
-    summary = summarise_regions(queries[~find_regions()["interior"][queries.point]])
-    assert summary["interior"] == {"rmse_px": None, "entropy": None, "queries": 0}
+from mmgsd.figures.symmetry import plot_symmetry_study
+from mmgsd.measure.regions import summarise_places
 
 
 @pytest.mark.parametrize("points", [625, 25])
 def test_the_study_has_a_map_a_group_and_two_sets_of_bars(points):
-    figure = plot_symmetry_study({"v4": make_queries(10.0, 30.0, points), "c4": make_queries(10.0, 15.0, points)})
+    tables = {"v4": make_queries(10.0, 30.0, points), "c4": make_queries(10.0, 15.0, points)}
+    figure = plot_symmetry_study({group: summarise_places(table) for group, table in tables.items()})
     maps = [axis for axis in figure.axes if axis.images]
     assert [axis.get_title() for axis in maps] == ["v4", "c4"]
     assert {axis.images[0].get_clim() for axis in maps} == {(0.0, 30.0)}
@@ -63,5 +31,5 @@ def test_the_study_has_a_map_a_group_and_two_sets_of_bars(points):
 
 
 def test_nothing_to_study_is_refused():
-    with pytest.raises(ValueError, match="tables must not be empty"):
+    with pytest.raises(ValueError, match="places must not be empty"):
         plot_symmetry_study({})

@@ -11,7 +11,7 @@ import pytest
 from dask.distributed import LocalCluster
 
 from mmgsd.config import OBJECTS, Preset, load_preset
-from mmgsd.experiments import configure_model, configure_study, list_rows, list_runs, vary_sigma
+from mmgsd.experiments import configure_model, configure_study, list_rows, list_runs, vary_seed, vary_sigma
 from mmgsd.measure import matrix
 from mmgsd.measure.evaluation import write_results
 from mmgsd.measure.matrix import (
@@ -73,6 +73,11 @@ def test_errors_of_several_seeds_are_written(
         file.unlink()
     write_seed_table(preset, tmp_path, 1, steps=1)  # seed 1 stays, though only seed 0 is asked for
     assert json.loads(written.read_text()) == table
+    model = configure_study(preset, "rope", "seeds", vary_seed([0]), steps=1)["pcl-0"].name
+    of_budget = {"rmse_mean": 3.0, "run": {"model": model}}
+    write_results({"rope": {"pcl": of_budget, "spcl": {"run": {"model": "another"}}}}, written.with_name("budget.json"))
+    write_seed_table(preset, tmp_path, 1, steps=1)  # the same model is not trained twice
+    assert json.loads(written.read_text()) == {**table, "rope": {"pcl-0": of_budget}}
 
 
 @pytest.mark.parametrize("words", ["--seeds -1", "--steps 10", "--seeds 2 --steps -1", "--study main --steps 9"])

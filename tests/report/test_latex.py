@@ -9,9 +9,9 @@ import pandas as pd
 import pytest
 
 from mmgsd.config import METHODS, OBJECTS, PRESETS
-from mmgsd.figures.symmetry import find_regions
 from mmgsd.measure.figure_data import FigureData
 from mmgsd.measure.metrics import PCK_PX, summarise_errors
+from mmgsd.measure.regions import find_regions
 from mmgsd.paths import find_root
 from mmgsd.report.claims import HELD, IN_PART, NOT_HELD, NOT_MEASURED, RULES, get, is_better, judge, list_claims
 from mmgsd.report.descriptions import LABELS
