@@ -32,8 +32,6 @@ NETWORKS = (*PASSES, "resnet34")  # the last is the contrastive papers' referenc
 ROUNDNESS = 0.2  # heatmap mass by which modes are a priori round and equally wide
 MAX_MODES = 64  # that can be asked for: more than any symmetry of the objects has, and few enough to fit in a moment
 OPTIMISERS = ("adamw", "muon")
-ADDED = {"optimiser": "adamw", "roundness": 0.2, "scene": "plain", "heads": False, "clutter": False,
-         "also": ""}  # later fields, and how it was done without them  # fmt: skip
 N_POINTS = 625  # material points of the cloth and the rope
 
 Config = TypeVar("Config", bound="RenderConfig | TrainConfig | EvaluateConfig")
@@ -50,6 +48,11 @@ def _check_object(name: str) -> None:
     taken = name not in OBJECTS and name.lower() in (*OBJECTS, *RESERVED)  # not every disk tells Cloth from cloth
     check("object", name, f"another name than {', '.join(map(repr, (*OBJECTS, *RESERVED)))}, which are taken: "
            f"{name + '2'!r}, for example", not taken)  # fmt: skip
+
+
+def _later(default: Any) -> Any:
+    """A field that came when data sets and models had names: it is not in them at its default."""
+    return dataclasses.field(default=default, metadata={"later": True})
 
 
 _set_frozen = object.__setattr__  # a field named ``object`` hides the builtin inside a class body
@@ -70,7 +73,7 @@ class RenderConfig:
     samples: int = 1  # Cycles samples a pixel, denoised
     rotation_deg: float = 180.0  # the object is turned by an angle from ± this; 45 is prior work's fix (cloth)
     ball: bool = False  # a ball at the rope's first end: prior work's way to break its symmetry
-    scene: str = "plain"  # or "workspace"
+    scene: str = _later("plain")  # or "workspace"
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -108,7 +111,7 @@ class TrainConfig:
     groups: int = 1  # parts of a batch normalised and paired each by itself; as many processes can share a step
     pairs: int = 60  # ordered pairs of images a step
     queries: int = 64  # source points a pair
-    optimiser: str = "adamw"  # or "muon": the convolutions' steps are made orthogonal
+    optimiser: str = _later("adamw")  # or "muon": the convolutions' steps are made orthogonal
     learning_rate: float = 1.5e-3
     schedule: str = "cosine"  # or "step": times 0.9 every 250 steps, the reference of the contrastive losses
     weight_decay: float = 0.02
@@ -120,10 +123,10 @@ class TrainConfig:
     augment: bool = True
     bend: float = 0.0  # augmentation stretches and squeezes images along random waves, by up to this share
     rotate: bool = True  # augmentation turns images by any angle; off where the rotation limit is the experiment
-    roundness: float = ROUNDNESS  # of the modes read from its heatmaps, a priori (`mmgsd.match.mixture.fit_modes`)
-    heads: bool = False  # it also learns where the object is, what is seen and whether it is there (`learn.heads`)
-    clutter: bool = False  # augmentation changes backgrounds and puts things in front (`learn.compositing`)
-    also: str = ""  # preset whose images of the object are trained on besides the data set's own, or ""
+    roundness: float = _later(ROUNDNESS)  # of the modes read from heatmaps, a priori (`mmgsd.match.mixture.fit_modes`)
+    heads: bool = _later(False)  # it also learns where the object is, what is seen, whether it is there (`learn.heads`)
+    clutter: bool = _later(False)  # augmentation changes backgrounds and puts things in front (`learn.compositing`)
+    also: str = _later("")  # preset whose images of the object are trained on besides the data set's own, or ""
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -246,22 +249,20 @@ PRESETS = {
 
 
 def digest(config: Config) -> str:
-    """Eight hexadecimal digits that differ where any field of the configuration differs.
-
-    Models keep their names where a field of `ADDED` is as it was before there was one.
-    """
+    """Eight hexadecimal digits that differ where any field of the configuration differs."""
     text = json.dumps(to_dict(config), sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:8]
 
 
+def list_later(kind: type[Config]) -> dict[str, Any]:
+    """{name: default} of the fields that what is stored lacks where they have their default."""
+    return {field.name: field.default for field in dataclasses.fields(kind) if "later" in field.metadata}
+
+
 def to_dict(config: Config) -> dict[str, Any]:
-    """All fields of a configuration but those of `ADDED` that are as before there was one: what is stored of it."""
-    return drop_added(dataclasses.asdict(config))
-
-
-def drop_added(values: dict[str, Any]) -> dict[str, Any]:
-    """Values without those of `ADDED` that say nothing new."""
-    return {name: value for name, value in values.items() if value != ADDED.get(name)}
+    """What is stored of a configuration: its fields but those of `list_later` that have their default."""
+    later = list_later(type(config)).items()
+    return {name: value for name, value in dataclasses.asdict(config).items() if (name, value) not in later}
 
 
 def from_dict(kind: type[Config], values: dict[str, Any]) -> Config:

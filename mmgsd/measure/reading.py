@@ -44,6 +44,7 @@ class Quality(NamedTuple):
 
     @property
     def gain(self) -> float:
+        """Found less spurious, by which readings are compared."""
         return self.found - self.spurious
 
 

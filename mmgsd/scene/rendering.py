@@ -27,7 +27,7 @@ from dask.distributed import Client, LocalCluster, as_completed
 from dask.system import cpu_count
 
 from mmgsd.checks import read_count, read_flag
-from mmgsd.config import ADDED, DEFAULT_GROUP, OBJECTS, OWN_GROUP, RenderConfig, drop_added, to_dict
+from mmgsd.config import DEFAULT_GROUP, OBJECTS, OWN_GROUP, RenderConfig, list_later, to_dict
 from mmgsd.dataset import load_dataset
 from mmgsd.dataset_format import FORMAT, SPLITS, encode_table, find_owner, is_member
 from mmgsd.files import (
@@ -288,9 +288,8 @@ def _is_whole(path: Path, job: dict, claimed: bool) -> bool:
 
 
 def _check_same_config(config: RenderConfig, stored: dict, folder: Path) -> None:
-    wanted, stored = _describe(config), drop_added(stored)
-    if stored != wanted:
-        there, wanted = ADDED | stored, ADDED | wanted
+    there, wanted = (list_later(RenderConfig) | values for values in (stored, _describe(config)))
+    if there != wanted:
         changed = [f"{k}: {there.get(k)!r} there, {v!r} asked for" for k, v in wanted.items() if there.get(k) != v]
         raise ValueError(f"{folder} holds another data set ({'; '.join(changed)}): use overwrite=True to replace it")
 
