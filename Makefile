@@ -16,6 +16,8 @@ TORCH_INDEX ?=
 CUDA ?=
 # make figures, paper, data-pack, data-unpack, data-sample, weights: of which preset.
 PRESET ?= paper
+# make test: in so many processes at once, by default one a core up to four; each computes in one thread.
+JOBS ?= $(shell n=$$(nproc 2>/dev/null || echo 2); echo $$(( n < 4 ? n : 4 )))
 # make lock: the uv program, and a folder that holds torch's CPU wheel.
 UV ?= uv
 FIND_LINKS ?=
@@ -29,6 +31,7 @@ TORCH := 2.13.0
 PY := .venv/bin/python
 PIP := env -u PYTHONDONTWRITEBYTECODE $(PY) -m pip --disable-pip-version-check install --quiet --only-binary :all:
 STAMP := .venv/.installed
+PYTEST := OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(PY) -m pytest --numprocesses $(JOBS) --dist loadfile
 PAPERMILL := $(PY) -m papermill --kernel python3
 
 .PHONY: help .venv reproduce smoke test lint unit notebooks-test figures paper readme weights data-pack data-unpack \
@@ -49,11 +52,11 @@ lint: $(STAMP) ## Check the style with ruff
 	$(PY) -m ruff check .
 
 unit: $(STAMP) ## Run the tests in tests/
-	$(PY) -m pytest tests
+	$(PYTEST) tests
 
 # run_all would run every notebook a second time: a test in tests/ runs it through papermill.
 notebooks-test: $(STAMP) ## Run the notebooks and compare their outputs with the committed ones
-	$(PY) -m pytest --nbval --nbval-current-env --nbval-cell-timeout=600 \
+	$(PYTEST) --nbval --nbval-current-env --nbval-cell-timeout=600 \
 		--nbval-sanitize-with=tests/nbval_sanitize.cfg notebooks/[01]*.ipynb notebooks/explore.ipynb notebooks/your_*.ipynb
 
 figures: $(STAMP) ## Draw the paper's figures of PRESET (paper) again from data/results, without training
