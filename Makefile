@@ -31,7 +31,7 @@ TORCH := 2.13.0
 PY := .venv/bin/python
 PIP := env -u PYTHONDONTWRITEBYTECODE $(PY) -m pip --disable-pip-version-check install --quiet --only-binary :all:
 STAMP := .venv/.installed
-PYTEST := OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(PY) -m pytest --numprocesses $(JOBS) --dist loadfile
+PYTEST := OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(PY) -m pytest --numprocesses $(JOBS) --dist loadfile --no-loadscope-reorder
 PAPERMILL := $(PY) -m papermill --kernel python3
 
 .PHONY: help .venv reproduce smoke test lint unit notebooks-test figures paper readme weights data-pack data-unpack \

@@ -24,6 +24,13 @@ os.environ.setdefault("MPLBACKEND", "Agg")  # no window, and before anything imp
 hypothesis.settings.register_profile("reproducible", derandomize=True, deadline=None, max_examples=50)
 hypothesis.settings.load_profile("reproducible")
 
+LONGEST = "test_run_all.py"
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The longest file first: where processes share the files, none is left with it at the end."""
+    items.sort(key=lambda item: item.path.name != LONGEST)
+
 
 @pytest.fixture
 def rng() -> np.random.Generator:

@@ -37,6 +37,8 @@ REPEATS = {  # claim: what repeats it, and the models of runs.json that it train
     "surest": ("`.venv/bin/python -m mmgsd.fold.rollouts paper`", ()),
 }
 
+STUDIES = {"inward": "symmetry", "group": "symmetry", "rotation-limit": "broken_symmetry", "ball": "broken_symmetry"}
+
 
 def make_findings(results: Mapping[str, Any]) -> str:
     """A Markdown list of the main findings, each with a link to its section of the results page."""
@@ -80,6 +82,8 @@ def sum_minutes(results: Mapping[str, Any], key: str, models: Iterable[str]) -> 
     runs = [get(results, "runs", f"{name}-{model}") for name in OBJECTS for model in models]
     if key == "sigma":
         runs = [row.get("run") for name in OBJECTS for row in (get(results, "sigma", name) or {}).values()]
+    elif key in STUDIES:
+        runs = [row.get("run") for row in (get(results, STUDIES[key]) or {}).values()]
     known = [run["minutes"] for run in runs if run]
     return f"{sum(known):.0f}" if known else "–"
 

@@ -36,9 +36,12 @@ def test_a_claim_without_results_is_not_measured() -> None:
 
 
 @pytest.mark.parametrize(
-    ("key", "models", "minutes"), [("rmse", ("mmgsd",), "50"), ("ball", (), "–"), ("sigma", (), "7")]
+    ("key", "models", "minutes"),
+    [("rmse", ("mmgsd",), "50"), ("ball", (), "–"), ("sigma", (), "7"), ("group", (), "9")],
 )
 def test_minutes_are_summed_over_the_runs_that_are_stored(key: str, models: tuple[str, ...], minutes: str) -> None:
     results = {"runs": {"cloth-mmgsd": {"minutes": 20.2}, "rope-mmgsd": {"minutes": 30.1}},
-               "sigma": {"cloth": {"1": {"run": {"minutes": 7.0}}}}}  # fmt: skip
+               "sigma": {"cloth": {"1": {"run": {"minutes": 7.0}}}},
+               "symmetry": {"c4": {"run": {"minutes": 4.0}}, "d4": {"run": {"minutes": 5.0}}},
+               "broken_symmetry": {"plain": {"rmse_mean": 3.0}}}  # fmt: skip
     assert sum_minutes(results, key, models) == minutes
