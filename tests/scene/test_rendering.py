@@ -114,14 +114,23 @@ def test_rendering_leaves_the_environment_as_it_was(tmp_path: Path) -> None:
     assert dict(os.environ) == before
 
 
+def list_blenders(pid: int) -> list[psutil.Process]:
+    """What renders of a process's children and theirs, of which any may end while it is looked at."""
+    found = []
+    with contextlib.suppress(psutil.NoSuchProcess):
+        for child in psutil.Process(pid).children(recursive=True):
+            with contextlib.suppress(psutil.NoSuchProcess):
+                found += [child] if "mmgsd.scene" in child.cmdline() else []
+    return found
+
+
 def wait_for_rendering_worker(pids: set[int]) -> int:
     """The first of the worker processes that has a Blender child."""
     deadline = time.monotonic() + 120
     while time.monotonic() < deadline:
         for pid in pids:
-            with contextlib.suppress(psutil.NoSuchProcess):  # a child may end while it is looked at
-                if any("mmgsd.scene" in " ".join(child.cmdline()) for child in psutil.Process(pid).children()):
-                    return pid
+            if list_blenders(pid):
+                return pid
         time.sleep(0.02)
     raise AssertionError("no worker began to render")
 
@@ -337,7 +346,7 @@ def test_children_and_their_temporary_folders_go_with_a_killed_parent(tmp_path: 
     process = start(tmp_path / "rope", 1, temporary=temporary)
     deadline, children = time.monotonic() + 120, []
     while not children and time.monotonic() < deadline:
-        children = [c for c in psutil.Process(process.pid).children(recursive=True) if "mmgsd.scene" in c.cmdline()]
+        children = list_blenders(process.pid)
         time.sleep(0.02)
     time.sleep(1)  # past its first imports
     process.kill()
