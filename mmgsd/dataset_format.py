@@ -110,6 +110,7 @@ def find_owner(folder: Path) -> Callable[[Path], bool]:
         named = set()
 
     def is_ours(path: Path) -> bool:
+        """Whether this project writes a file of that path, relative to the data set."""
         name = path.as_posix()
         own = name in TABLES or (name in named if named else RENDERED.fullmatch(name) is not None)
         return own or ASIDE.fullmatch(path.name) is not None

@@ -31,6 +31,7 @@ def times(factor: float, *, of: int = 0) -> Rule:
     """The start's value times ``factor``: a float, a whole number from 1 on, or the next multiple ``of``."""
 
     def apply(start: TrainConfig, name: str) -> float:
+        """The field's value, from that of ``start``."""
         value = factor * getattr(start, name)
         if of:
             return math.ceil(value / of) * of

@@ -108,6 +108,7 @@ class Explorer:
 
     @method.setter
     def method(self, name: str) -> None:
+        """Answer all points by the matcher of that name, or raise and leave all as it was."""
         if name not in self.matchers:
             raise ValueError(f"method must be one of {', '.join(map(repr, self.matchers))}, got {name!r}")
         before, self.pictures.method = self.pictures.method, name
@@ -124,6 +125,7 @@ class Explorer:
 
     @together.setter
     def together(self, on: bool) -> None:
+        """Answer all points anew, or raise and leave all as it was."""
         before, self.pictures.together = self.pictures.together, bool(on)
         try:
             self._answer(self.points)
@@ -275,6 +277,7 @@ def prepare_baseline(matcher: FeatureMatcher, scene: Scene) -> Callable[..., Mat
     )
 
     def answer(xy: np.ndarray, *, joint: bool = False) -> Match:
+        """The answer about pixels of the whole image, from that about the small one."""
         if joint:
             raise ValueError("together must be off for this method: trained weights alone answer points together")
         found = matcher.match(*small, (xy + 0.5) / ratio0 - 0.5, mask1=mask)

@@ -158,6 +158,7 @@ def load_training_images(data: Dataset, input_px: int, *, indices: np.ndarray | 
     width, height = (round(s * CACHE_SCALE) for s in compute_input_size(data.size, input_px))
 
     def load(index: int) -> tuple[np.ndarray, np.ndarray]:
+        """One image and its mask, reduced."""
         image, mask = data.load_image(index), data.load_mask(index).astype(np.uint8) * 255
         return tuple(cv2.resize(a, (width, height), interpolation=cv2.INTER_AREA) for a in (image, mask))
 

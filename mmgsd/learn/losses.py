@@ -87,6 +87,7 @@ def _integrate_hats(mean: Tensor, centres: Tensor, sigma: float) -> Tensor:
     width = float(centres[1] - centres[0]) / sigma
 
     def tail(t: Tensor) -> Tensor:
+        """φ(t) − |t| Φ(−|t|): what h(t) has beyond max(t, 0)."""
         t = t.abs()
         return torch.exp(-0.5 * t * t) / math.sqrt(2 * math.pi) - t * torch.special.ndtr(-t)
 

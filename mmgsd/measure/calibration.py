@@ -177,6 +177,7 @@ def fit_powers(modes: Modes, distance: np.ndarray) -> tuple[float, ...]:
     known = np.stack([*(np.log(np.maximum(each, 1e-6)) for each in modes), np.ones(len(distance))], 1)  # (M, 4)
 
     def measure(slopes: np.ndarray) -> float:
+        """Negative log-likelihood of the logistic model, with a little weight decay."""
         logits = slopes[0] * radii + (known @ slopes[1:])[:, None]
         return float(np.mean(np.logaddexp(0, logits) - within * logits)) + 1e-6 * float(slopes @ slopes)
 
@@ -220,6 +221,7 @@ def calibrate_temperature(
     logits, true = torch.cat(logits), torch.from_numpy(np.concatenate(true)).to(logits[0].device)
 
     def measure(log_temperature: float) -> float:
+        """Negative log-likelihood of the true matches."""
         return -float((logits / np.exp(log_temperature)).log_softmax(-1).gather(1, true).mean())
 
     best = minimize_scalar(measure, bounds=np.log(TEMPERATURES), method="bounded", options={"xatol": 0.01})

@@ -148,6 +148,7 @@ def _classical_answer(method: str, data: Dataset) -> Answer:
     matcher, last = BaselineMatcher(method), np.array(data.size, dtype=np.float32) - 0.5
 
     def answer(first: int, second: int, xy: np.ndarray, n: np.ndarray) -> tuple[Mixture, Tensor]:
+        """Modes and entropies (nats) of pixels ``xy`` of the first image."""
         xy = np.clip(xy, -0.5, last)  # a corner may stick out of the image: the networks take its nearest pixel as well
         heatmap, centres = matcher.compute_heatmaps(images[first], images[second], xy, masks[second])
         return read_heatmap(heatmap, torch.from_numpy(n), centres)
@@ -161,6 +162,7 @@ def _chance_answer(method: str, data: Dataset) -> Answer:
     rng = np.random.default_rng(0)
 
     def answer(first: int, second: int, xy: np.ndarray, n: np.ndarray) -> tuple[Mixture, Tensor]:
+        """Modes and entropies (nats) of pixels ``xy`` of the first image."""
         shape, on_object = (len(xy), n.max()), pixels[second]
         centre = np.broadcast_to(on_object.mean(0), (*shape, 2))
         modes = centre if method == "centre" else on_object[rng.integers(len(on_object), size=shape)]

@@ -173,6 +173,7 @@ def ask_photographs(
     pairs = [(source, target) for target in photographs for source in read if source[0].path != target.path]
 
     def ask() -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """Both images and the pixels of each pair; a target is read once."""
         last, image = None, None
         for (source, image0), target in tqdm(pairs, desc="measure", unit="pair", disable=not progress, leave=False):
             last, image = (last, image) if target is last else (target, target.read())

@@ -66,6 +66,7 @@ def model_answer(matcher: Matcher, data: Dataset, config: EvaluateConfig) -> Ans
     descriptors = describe(matcher, data, np.unique(draw_pairs(data, config)))
 
     def answer(first: int, second: int, xy: np.ndarray, n: np.ndarray) -> tuple[Mixture, Tensor]:
+        """Modes and entropies (nats) of pixels ``xy`` of the first image."""
         heatmap = matcher.compute_heatmaps(descriptors[first], descriptors[second], torch.from_numpy(xy), data.size)
         centres = compute_cell_centres(data.size, heatmap.shape[-2:])
         return read_heatmap(heatmap, torch.from_numpy(n), centres, reading=matcher.reading)
