@@ -24,6 +24,11 @@ RENDERED_SIDE = 2 * SIDE - 1  # once subdivided: every third vertex is a materia
 EXTENT = 1.0  # m
 VISIBILITY_RADIUS = 0.004  # m; less than the distance that self-collision keeps between two layers
 STATES = {"flat": 0.10, "wrinkled": 0.24, "folded": 0.26, "folded twice": 0.10, "corner": 0.20, "crumpled": 0.10}
+# in a workspace: lying about as on a table, and folded as grippers fold
+WORKSPACE_STATES = {
+    "flat": 0.14, "wrinkled": 0.22, "folded": 0.16, "folded twice": 0.06, "corner": 0.12, "crumpled": 0.08,
+    "grasped": 0.16, "grasped twice": 0.06,
+}  # fmt: skip
 SETTLE_FRAMES = 8
 FRICTION = 40.0  # of the floor, in Blender's units
 ATTEMPTS = 3  # at a move, before the cloth starts anew
@@ -46,8 +51,9 @@ def build_cloth(rng: np.random.Generator, config: RenderConfig) -> DeformedObjec
 
     The 625 points are (25, 25) row-major vertices of the rendered surface itself; 1 m a side.
     """
-    sheet = draw_rectangle(rng) if config.scene == "workspace" else square_sheet()
-    state = str(rng.choice(list(STATES), p=list(STATES.values())))
+    workspace = config.scene == "workspace"
+    sheet, states = draw_rectangle(rng) if workspace else square_sheet(), WORKSPACE_STATES if workspace else STATES
+    state = str(rng.choice(list(states), p=list(states.values())))
     vertices, frames = deform(rng, state, sheet)
     return hand_over(vertices, {"state": state, "physics_frames": frames}, sheet)
 
@@ -69,16 +75,16 @@ def hand_over(vertices: np.ndarray, info: dict[str, str | float | int], sheet: S
 
 
 def deform(rng: np.random.Generator, state: str, sheet: Sheet | None = None) -> tuple[np.ndarray, int]:
-    """Simulate one state of ``STATES`` of a sheet (None: the square cloth): vertices (V, 3) m, and physics frames.
+    """Simulate one state of ``MOVES`` of a sheet (None: the square cloth): vertices (V, 3) m, and physics frames.
 
     ValueError for another state; SceneError, which counts why, where the sheet never comes to lie in it.
     """
-    if state not in STATES:
-        raise ValueError(f"state must be one of {', '.join(STATES)}, got {state!r}")
+    if state not in MOVES:
+        raise ValueError(f"state must be one of {', '.join(MOVES)}, got {state!r}")
     sheet, frames, faults = sheet or square_sheet(), 0, Counter()
     for _ in range(STARTS):
         vertices = _rippled(rng, sheet, 0.001 if state == "flat" else 0.008)
-        for move in _MOVES[state]:
+        for move in MOVES[state]:
             vertices, count = _perform(rng, sheet, vertices, move, faults)
             frames += count
             if vertices is None:
@@ -153,9 +159,12 @@ def square_sheet() -> Sheet:
 
 
 def draw_rectangle(rng: np.random.Generator) -> Sheet:
-    """The square cloth, or one that is a little or much longer than wide: its points are those of the square."""
+    """The square cloth, or one that is a little or up to 1.5 times longer than wide.
+
+    Its points are those of the square, and its corners are as alike as a square's.
+    """
     square = square_sheet()
-    width = rng.choice([1.0, rng.uniform(0.93, 1.0), rng.uniform(0.55, 0.9)], p=[0.6, 0.25, 0.15])
+    width = rng.choice([1.0, rng.uniform(0.93, 1.0), rng.uniform(1 / 1.5, 0.93)], p=[0.5, 0.15, 0.35])
     return dataclasses.replace(square, rest=square.rest * (width, 1.0, 1.0))
 
 
@@ -246,6 +255,25 @@ def _fold_over(rng: np.random.Generator, vertices: np.ndarray, angle: float, sha
     return grasps, frames
 
 
+def _fold_grasped(rng: np.random.Generator, vertices: np.ndarray) -> tuple[list[Grasp], int]:
+    """Carry one corner of a cloth (1369, 3) m or two neighbours towards the opposite, as one gripper or two do."""
+    corners = np.array([0, SIDE - 1, SIDE**2 - 1, SIDE * (SIDE - 1)])  # around the cloth
+    first, hands = int(rng.integers(4)), int(rng.integers(1, 3))
+    held = np.roll(corners, -first)[:hands]
+    opposite = np.roll(corners, -first - 2)[:hands][::-1]
+    shifts = rng.uniform(0.4, 1.0) * (vertices[opposite, :2] - vertices[held, :2])
+    shifts = shifts + rng.normal(scale=0.03, size=shifts.shape)
+    length = np.linalg.norm(shifts, axis=1)
+    frames = int(15 + 20 * length.max())
+    grasps = {int(i): arc_path(np.append(shift, 0.03), 0.4 * far, frames)
+              for i, shift, far in zip(held, shifts, length, strict=True)}  # fmt: skip
+    along = (vertices[:, :2] - vertices[held[0], :2]) @ shifts.mean(axis=0) / max(length.max(), 1e-6)
+    anchors = np.setdiff1d(np.flatnonzero(along > 0.55 * length.max()), held)
+    for i in rng.choice(anchors, size=min(4, len(anchors)), replace=False):
+        grasps[int(i)] = np.zeros((frames, 3))
+    return [Grasp(i, path) for i, path in grasps.items()], frames
+
+
 def arc_path(shift: np.ndarray, height: float, frames: int) -> np.ndarray:
     """Displacements (F, 3) along a half ellipse to ``shift`` (3,), ``height`` m high, slow at both ends, then held."""
     hold = 3
@@ -257,13 +285,15 @@ def arc_path(shift: np.ndarray, height: float, frames: int) -> np.ndarray:
 
 
 # Moves follow each other; each is made of plans and tried again from where it began if the cloth comes to no good.
-_MOVES: dict[str, tuple[tuple[Plan, ...], ...]] = {
+MOVES: dict[str, tuple[tuple[Plan, ...], ...]] = {
     "flat": ((_settle,),),
     "wrinkled": ((_drop, _drag, _settle),),
     "folded": ((_fold, _settle),),
     "folded twice": ((_fold, _settle), (_fold, _settle)),
     "corner": ((_fold_corner, _settle),),
     "crumpled": ((_gather, _settle),),
+    "grasped": ((_fold_grasped, _settle),),
+    "grasped twice": ((_fold_grasped, _settle), (_fold_grasped, _settle)),
 }
 
 

@@ -46,7 +46,7 @@ def paint_surface(rng: np.random.Generator, colour: Bytes, *, sheet: bool) -> tu
     shader = new_shader()
     kind = str(rng.choice(["plain", "procedural", "picture"], p=[0.4, 0.25, 0.35] if sheet else [0.3, 0.45, 0.25]))
     if kind == "picture":
-        name = str(rng.choice(list(prints.PICTURES), p=[0.34, 0.16, 0.16, 0.14, 0.1, 0.1]))
+        name = str(rng.choice(list(prints.PICTURES), p=[0.3, 0.12, 0.1, 0.12, 0.08, 0.08, 0.2]))
         pixels = prints.PICTURES[name](rng, colour)
         place = shader.node("TexCoord").outputs["Generated" if sheet else "Object"]
         scale = 1.0 if sheet else np.exp(rng.uniform(np.log(0.25), np.log(2.0)))

@@ -1,26 +1,34 @@
 """Pictures for a workspace's materials: what is printed, woven or stuck on a cloth, a rope, a board or a book.
 
-All are (H, W, 3) uint8 sRGB, painted from an explicit ``rng``; the photographs are those that scikit-image carries.
+All are (H, W, 3) uint8 sRGB, painted from an explicit ``rng``; the photographs are those that scikit-image,
+scikit-learn and Matplotlib carry, and parts of Blender's environment maps.
 """
 
 from __future__ import annotations
 
 import functools
+import importlib.util
 import string
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import skimage
 from PIL import Image, ImageDraw, ImageFont
 
+from mmgsd.scene import maps
 from mmgsd.scene.textures import as_bytes, draw_clutter, draw_colour
 
 SIDE = 512  # px of a picture
-PHOTOGRAPHS = (
-    "astronaut.png", "brick.png", "chelsea.png", "coffee.png", "grass.png", "gravel.png", "hubble_deep_field.jpg",
-    "ihc.png", "motorcycle_left.png", "page.png", "retina.jpg", "rocket.jpg", "text.png", "color.png",
-)  # fmt: skip
+PHOTOGRAPHS = {  # package: files of its own
+    "skimage/data": (
+        "astronaut.png", "brick.png", "chelsea.png", "coffee.png", "grass.png", "gravel.png", "hubble_deep_field.jpg",
+        "ihc.png", "motorcycle_left.png", "page.png", "retina.jpg", "rocket.jpg", "text.png", "color.png", "camera.png",
+        "coins.png", "motorcycle_right.png",
+    ),
+    "sklearn/datasets/images": ("china.jpg", "flower.jpg"),
+    "matplotlib/mpl-data/sample_data": ("grace_hopper.jpg",),
+}  # fmt: skip
+FILES = tuple(f"{folder}/{name}" for folder, names in PHOTOGRAPHS.items() for name in names)
 
 TABLES = (
     (196, 154, 108), (160, 110, 66), (222, 188, 140), (110, 72, 46), (240, 240, 238), (225, 225, 228), (200, 200, 200),
@@ -76,22 +84,41 @@ def to_linear(colour: Bytes) -> tuple[float, float, float, float]:
 
 @functools.cache
 def load_photograph(name: str) -> np.ndarray:
-    """A photograph of scikit-image's, square."""
-    image = Image.open(Path(skimage.__file__).parent / "data" / name).convert("RGB")
+    """One of `FILES`, square."""
+    package, _, inside = name.partition("/")
+    image = Image.open(Path(importlib.util.find_spec(package).origin).parent / inside).convert("RGB")
     side = min(image.size)
     left, top = (image.width - side) // 2, (image.height - side) // 2
     return np.asarray(image.crop((left, top, left + side, top + side)).resize((SIDE, SIDE)))
 
 
 def paint_photograph(rng: np.random.Generator, colour: Bytes) -> np.ndarray:
-    """A part of a photograph, mirrored, turned and tinted at random."""
-    image = load_photograph(str(rng.choice(PHOTOGRAPHS)))
-    side = int(rng.uniform(0.4, 1.0) * SIDE)
+    """A part of a photograph or of an environment map, mirrored, turned and tinted at random."""
+    image = maps.draw_part(rng, SIDE) if rng.random() < 0.3 else load_photograph(str(rng.choice(FILES)))
+    side = int(rng.uniform(0.25, 1.0) * SIDE)
     left, top = rng.integers(0, SIDE - side + 1, size=2)
     part = np.rot90(image[top : top + side, left : left + side][:, :: rng.choice([-1, 1])], rng.integers(4))
     if rng.random() < 0.4:
         part = part[..., rng.permutation(3)]
     return np.asarray(Image.fromarray(np.ascontiguousarray(part)).resize((SIDE, SIDE)))
+
+
+def paint_collage(rng: np.random.Generator, colour: Bytes) -> np.ndarray:
+    """Parts of photographs and areas of one colour over each other, of all sizes: edges at every scale."""
+    image = Image.fromarray(paint_photograph(rng, colour))
+    for _ in range(rng.integers(4, 40)):
+        reach = SIDE * np.exp(rng.uniform(np.log(0.03), np.log(0.4), size=2))
+        left, top = (rng.uniform(-0.2, 1.0, size=2) * SIDE).astype(int)
+        size = tuple(np.maximum(2, reach.astype(int)).tolist())
+        part = Image.new("RGB", size, draw_paint(rng))
+        if rng.random() < 0.5:
+            part = Image.fromarray(paint_photograph(rng, colour)).resize(size)
+        shape = Image.new("L", size, 0)
+        pen = ImageDraw.Draw(shape)
+        (pen.ellipse if rng.random() < 0.5 else pen.rectangle)([0, 0, size[0] - 1, size[1] - 1], fill=255)
+        turn = float(rng.uniform(0, 360))
+        image.paste(part.rotate(turn, expand=True), (left, top), shape.rotate(turn, expand=True))
+    return np.array(image)
 
 
 def paint_clutter(rng: np.random.Generator, colour: Bytes) -> np.ndarray:
@@ -142,7 +169,7 @@ def paint_gradient(rng: np.random.Generator, colour: Bytes) -> np.ndarray:
 
 PICTURES: dict[str, Paint] = {
     "photograph": paint_photograph, "clutter": paint_clutter, "mosaic": paint_mosaic, "page": paint_page,
-    "lines": paint_lines, "gradient": paint_gradient,
+    "lines": paint_lines, "gradient": paint_gradient, "collage": paint_collage,
 }  # fmt: skip
 
 
@@ -210,8 +237,8 @@ def _plaid(rng: np.random.Generator, colour: Bytes) -> np.ndarray:
 
 def _printed(rng: np.random.Generator, colour: Bytes) -> np.ndarray:
     """A picture over all of the cloth."""
-    names = ["photograph", "clutter", "mosaic", "page", "gradient"]
-    return PICTURES[str(rng.choice(names, p=[0.35, 0.25, 0.2, 0.1, 0.1]))](rng, colour)
+    names = ["photograph", "collage", "clutter", "mosaic", "page", "gradient"]
+    return PICTURES[str(rng.choice(names, p=[0.35, 0.25, 0.12, 0.12, 0.08, 0.08]))](rng, colour)
 
 
 def _repeated(rng: np.random.Generator, colour: Bytes) -> np.ndarray:
@@ -243,7 +270,7 @@ FABRICS: dict[str, Paint] = {
     "repeated": _repeated, "quilted": _quilted,
 }  # fmt: skip
 SHARES = {
-    "plain": 0.34, "mottled": 0.12, "striped": 0.2, "plaid": 0.08, "printed": 0.12, "repeated": 0.09, "quilted": 0.05,
+    "plain": 0.3, "mottled": 0.1, "striped": 0.16, "plaid": 0.08, "printed": 0.22, "repeated": 0.08, "quilted": 0.06,
 }  # fmt: skip
 
 

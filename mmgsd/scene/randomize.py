@@ -103,10 +103,15 @@ def _draw_lamp(rng: np.random.Generator, scene: bpy.types.Scene) -> tuple[bpy.ty
     return lamp, float(rng.uniform(1.8, 4.0))
 
 
-def new_lamp(scene: bpy.types.Scene, kind: str) -> bpy.types.Object:
-    """Replace the scene's only lamp by a ``SUN`` or an ``AREA``."""
+def remove_lamp() -> None:
+    """Put out the scene's lamp, if there is one."""
     if "lamp" in bpy.data.objects:
         bpy.data.lights.remove(bpy.data.objects["lamp"].data)  # takes the object with it
+
+
+def new_lamp(scene: bpy.types.Scene, kind: str) -> bpy.types.Object:
+    """Replace the scene's only lamp by a ``SUN`` or an ``AREA``."""
+    remove_lamp()
     data = bpy.data.lights.new("lamp", kind)
     data.cycles.use_multiple_importance_sampling = False  # sampled directly alone: less noise on matt surfaces
     lamp = bpy.data.objects.new("lamp", data)

@@ -51,7 +51,7 @@ from mmgsd.symmetry import GRID_GROUPS, LINE_GROUPS, load_group, load_mirror
 
 IMAGES_A_BATCH = 30  # a child process ends after about so many, which bounds its memory
 SCENES = {"cloth": 2, "rope": 1}  # to be raised where the same configuration gives another object than before
-WORKSPACES = 1  # likewise of what is seen around the object in the scene "workspace"
+WORKSPACES = 2  # likewise of what is seen around the object in the scene "workspace"
 GROUPS = {"cloth": GRID_GROUPS, "rope": LINE_GROUPS}
 BATCH = re.compile(r"(train|test)_\d+\.(zip|tmp)(\.damaged)?|config\.(json|tmp)(\.damaged)?")
 LABELS = {"episode", "view", "split", "xy", "visible", "intrinsics", "camera_pose", "info"}  # of a view in a batch

@@ -16,7 +16,7 @@ import numpy as np
 from mathutils import Euler, Vector
 
 from mmgsd.config import RenderConfig
-from mmgsd.scene import randomize, render
+from mmgsd.scene import maps, randomize, render
 from mmgsd.scene.cloth import EXTENT
 from mmgsd.scene.grounds import Site, draw_ground
 from mmgsd.scene.materials import paint_object, remove_view
@@ -26,7 +26,7 @@ from mmgsd.scene.things import add_things
 ABSENT = 0.035  # share of the views without the object, of those that nobody has masked
 MAX_TILT_DEG = 50.0
 MAX_OUTSIDE = 0.05  # share of the material points that may fall out of the picture
-LEAST_PX = 4.0  # of a rope's diameter
+LEAST_PX = 2.0  # of a rope's diameter
 TRIES = 60  # to frame the object, before the camera looks straight down
 
 
@@ -145,6 +145,7 @@ class _Lighting:
     share: float  # of the views
 
 
+MAPPED = 0.35  # share of the views under an environment map, half of them beside a lamp of `LIGHTS`
 LIGHTS = {
     "even": _Lighting((0.7, 1.2), (0.6, 1.0), (10.0, 60.0), 0.3),
     "sun": _Lighting((0.7, 1.5), (0.12, 0.4), (0.4, 3.0), 0.25),
@@ -155,16 +156,27 @@ LIGHTS = {
 
 
 def draw_light(rng: np.random.Generator, scene: bpy.types.Scene, side: float, target: np.ndarray) -> str:
-    """Light the object at ``target`` (3,) m with a sun or a lamp near by, warm, cold or coloured; the light's name."""
+    """Light the object at ``target`` (3,) m, warm, cold or coloured: with a sun or a lamp near by, or all around it.
+
+    Returns the light's name.
+    """
+    mapped = rng.random() < MAPPED
+    if mapped and rng.random() < 0.5:
+        randomize.remove_lamp()
+        return maps.light_world(rng, scene, np.exp(rng.uniform(np.log(0.5), np.log(1.4))), _draw_tint(rng))
     name = str(rng.choice(list(LIGHTS), p=[light.share for light in LIGHTS.values()]))
     light = LIGHTS[name]
     exposure, ambient = np.exp(rng.uniform(*np.log(light.exposure))), rng.uniform(*light.ambient)
     colour = _draw_tint(rng)
     sky = np.sqrt(colour) if rng.random() < 0.5 else colour
-    randomize.set_world(scene, (*np.clip(sky, 0, 2).tolist(), 1.0), exposure * ambient)
+    if mapped:
+        name = f"{name}, {maps.light_world(rng, scene, exposure * ambient, sky)}"
+    else:
+        maps.remove_map(scene)
+        randomize.set_world(scene, (*np.clip(sky, 0, 2).tolist(), 1.0), exposure * ambient)
     elevation, azimuth = np.radians(rng.uniform(20, 85)), rng.uniform(0, 2 * np.pi)
     towards = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
-    near = name in ("lamp", "dim")
+    near = light.width[1] < 1  # m, of a lamp; a sun's are degrees
     data = randomize.new_lamp(scene, "AREA" if near else "SUN")
     width, distance = rng.uniform(*light.width), rng.uniform(0.8, 3.0) * max(side, 0.5)
     energy = exposure * (1 - ambient) / np.sin(elevation) * np.pi

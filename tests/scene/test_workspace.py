@@ -15,7 +15,7 @@ bpy = pytest.importorskip("bpy")
 
 from mmgsd.config import RenderConfig  # noqa: E402
 from mmgsd.paths import find_root  # noqa: E402
-from mmgsd.scene import cloth, grounds, materials, prints, render, solids, things, workspace  # noqa: E402
+from mmgsd.scene import cloth, grounds, maps, materials, prints, render, solids, things, workspace  # noqa: E402
 from mmgsd.scene.episode import render_episode  # noqa: E402
 from mmgsd.scene.render import DeformedObject  # noqa: E402
 from mmgsd.scene.sheet import load_sheet  # noqa: E402
@@ -125,6 +125,54 @@ def test_things_cast_shadows() -> None:
     image, _ = render.render_image(scene, seed=0)
     row = image[SIZE[1] // 2].mean(axis=1)
     assert row[360] > 2 * row[130]
+
+
+def photograph_sheet(scene: bpy.types.Scene) -> np.ndarray:
+    """A small picture (64, 64, 3) of a large white sheet from above."""
+    camera = workspace.frame_points(np.random.default_rng(0), FLAT.points, (64, 64), 0.0, 0.0, 1.0, 3.0)
+    render.place_camera(scene, camera)
+    return render.render_image(scene, seed=0)[0]
+
+
+@pytest.mark.parametrize("path", maps.list_maps(), ids=lambda path: path.stem)
+def test_a_map_lights_a_level_sheet_as_brightly_as_asked(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(maps, "list_maps", lambda: [path])
+    scene, rng = render.reset_scene(), np.random.default_rng(0)
+    render.setup_cycles(scene, (64, 64), 16)
+    grounds._add_floor(materials.paint_plain(np.random.default_rng(1), (255, 255, 255)), 0.0)
+    assert maps.light_world(rng, scene, 0.5, np.ones(3)) == f"map {path.stem}"
+    assert photograph_sheet(scene).mean() == pytest.approx(render.encode_srgb(np.array(0.5)), rel=0.12)
+    maps.remove_map(scene)
+    workspace.randomize.set_world(scene, (1.0, 0.0, 0.0, 1.0), 1.0)
+    assert photograph_sheet(scene)[..., 1:].mean() < 40  # nothing of the map is left
+
+
+def test_a_third_of_the_views_are_lit_by_maps_and_half_of_these_by_a_lamp_too() -> None:
+    scene, rng = render.reset_scene(), np.random.default_rng(0)
+    names = [workspace.draw_light(rng, scene, 1.0, np.zeros(3)) for _ in range(150)]
+    mapped, alone = (np.mean([name.startswith("map") or (both and "map" in name) for name in names])
+                     for both in (True, False))  # fmt: skip
+    assert 0.25 < mapped < 0.45 and 0.1 < alone < 0.26
+
+
+@pytest.mark.parametrize("hands", [1, 2])
+def test_grippers_carry_corners_over_the_cloth(hands: int) -> None:
+    corners = {0, cloth.SIDE - 1, cloth.SIDE * (cloth.SIDE - 1), cloth.SIDE**2 - 1}
+    rng, seen = np.random.default_rng(0), 0
+    for _ in range(40):
+        grasps, frames = cloth._fold_grasped(rng, cloth.flat_vertices())
+        carried = [grasp for grasp in grasps if grasp.path[-1, :2].any()]
+        seen += len(carried) == hands
+        assert {grasp.vertex for grasp in carried} <= corners and all(len(grasp.path) == frames for grasp in grasps)
+        assert all(0.3 < np.linalg.norm(grasp.path[-1, :2]) < 1.6 for grasp in carried)
+    assert seen > 8
+
+
+def test_cloths_of_a_workspace_are_squares_and_rectangles_up_to_three_by_two() -> None:
+    rng = np.random.default_rng(0)
+    sides = [np.ptp(cloth.draw_rectangle(rng).rest[:, :2], axis=0) for _ in range(300)]
+    ratio = np.array([side.max() / side.min() for side in sides])
+    assert ratio.max() <= 1.5 + 1e-6 and 0.4 < np.mean(ratio == 1) < 0.6 and np.mean(ratio > 1.08) > 0.25
 
 
 @pytest.mark.parametrize("name", [*prints.PICTURES, *prints.FABRICS])
