@@ -26,8 +26,9 @@ OWN_GROUP = "own"  # of any other object: what its file says
 RESERVED = ("experiments", "models", "notebooks", "queries", "sample", *(f"{name}-broken" for name in OBJECTS),
             *(f"{name}-{method}" for name in OBJECTS for method in METHODS))  # fmt: skip
 CONTRASTIVE_REVISION = "r2"  # of PCL's and SPCL's training, to be raised with it: no older model passes for a new one
-PASSES = {"lite0": 1, "lite0x2": 2, "lite0x2fine": 2}  # over the feature pyramid
-DETAILED = ("lite0x2fine",)  # whose trunk sees the image at half its size, a light branch at the whole
+PASSES = {"lite0": 1, "lite0x2": 2, "lite0x2fine": 2, "dinov2s": 2}  # over the feature pyramid
+DETAILED = ("lite0x2fine", "dinov2s")  # whose trunk sees coarsely, and a light branch the image as it is
+FROZEN = ("dinov2s",)  # whose trunk is one for all models: no training changes it, no model's file holds it
 NETWORKS = (*PASSES, "resnet34")  # the last is the contrastive papers' reference
 ROUNDNESS = 0.2  # heatmap mass by which modes are a priori round and equally wide
 MAX_MODES = 64  # that can be asked for: more than any symmetry of the objects has, and few enough to fit in a moment

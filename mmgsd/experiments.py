@@ -117,6 +117,11 @@ MODELS = (
           scene={"rotation_deg": 45.0}),
     Model("plain", "rope, plain", "pcl", {"group": "identity"}, ("fixes",), objects=("rope",)),
     Model("ball at one end", "rope, ball at one end", "plain", {}, ("fixes",), objects=("rope",), scene={"ball": True}),
+    # which trunk the shipped models have: everything else of their training alike
+    Model("light", "EfficientNet-Lite0, trained", "mmgsd",
+          {"network": "lite0x2fine", "optimiser": "muon", "input_px": times(2), "roundness": 0.05, "heads": True,
+           "clutter": True, "also": "workspace"}, ("backbones",), "EfficientNet-Lite0"),
+    Model("dinov2s", "DINOv2 ViT-S/14, frozen", "light", {"network": "dinov2s"}, ("backbones",), "DINOv2 ViT-S"),
     # what each part of the shipped models' training brings, one after another
     Model("mmgsd_workspace", "MMGSD, workspace renders too", "mmgsd", {"also": "workspace"}, ("robustness",),
           "+ workspace"),
@@ -135,9 +140,9 @@ UNTRAINED = (
 )
 ROWS = {row.name: row for row in (*MODELS, *UNTRAINED)}
 SHIPPED = {"shipped": "", "mmgsd": "-paper", "spcl": "-spcl"}  # row: what its files' names in data/weights end with
-SMALL = ("symmetry", "budget", "sigma", "fixes", "robustness")  # studies of the equal, smaller budget
+SMALL = ("symmetry", "budget", "sigma", "fixes", "robustness", "backbones")  # studies of the equal, smaller budget
 RUN = ("first", "symmetry", "budget", "sigma", "main")  # studies that are run unless one is named, in this order
-STUDIES = (*RUN, "robustness", "shipped")  # on a preset's own images and one seed: not "fixes" and "seeds"
+STUDIES = (*RUN, "robustness", "backbones", "shipped")  # on a preset's own images and one seed: not "fixes" and "seeds"
 
 
 def list_rows(study: str) -> list[Model]:

@@ -88,7 +88,7 @@ def test_unknown_preset_names_the_accepted_ones() -> None:
         (
             TrainConfig,
             {"network": "vgg"},
-            "network must be one of 'lite0', 'lite0x2', 'lite0x2fine', 'resnet34', got 'vgg'",
+            "network must be one of .*'lite0'.*'resnet34', got 'vgg'",
         ),
         (TrainConfig, {"optimiser": "adam"}, "optimiser must be one of 'adamw', 'muon' .did you mean 'adamw'"),
         (TrainConfig, {"schedule": "none"}, "schedule must be one of 'cosine', 'step'"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 from pathlib import Path
 
@@ -12,7 +13,8 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from mmgsd.config import DETAILED, NETWORKS, PASSES
+from mmgsd.config import DETAILED, FROZEN, NETWORKS, PASSES
+from mmgsd.learn import dinov2
 from mmgsd.learn.heads import Heads, Outputs
 
 QUIET = 0.1  # scale of what a pass adds that is put onto trained ones: their answers hardly change at first
@@ -22,7 +24,11 @@ TAPS = {2: 24, 4: 40, 10: 112, 15: 320}  # EfficientNet-Lite0: block after which
 
 
 class PyramidNetwork(nn.Module):
-    """EfficientNet-Lite0 trunk with a feature pyramid; (B, 3, H, W) in [0, 1] to (B, roles * D, H / 4, W / 4).
+    """A trunk with a feature pyramid; (B, 3, H, W) in [0, 1] to (B, roles * D, H / 4, W / 4).
+
+    The trunk is EfficientNet-Lite0, or with ``frozen`` DINOv2's ViT-S/14 as it is (`mmgsd.learn.dinov2`), which is no
+    part of the module: each level of the pyramid is then the same three blocks' features, resized. A patch of it is 16
+    px of the image.
 
     ``passes`` over the pyramid: the first upwards, each further one (`PyramidPass`) down and up again. With ``detail``
     the trunk sees the image at half its size, and three convolutions add what they find at the whole, the edges of a
@@ -34,13 +40,15 @@ class PyramidNetwork(nn.Module):
 
     def __init__(
         self, descriptor_dim: int, *, roles: int = 1, passes: int = 1, detail: bool = False, heads: bool = False,
-        width: int = 96, pretrained: bool = True,
+        frozen: bool = False, width: int = 96, pretrained: bool = True,
     ) -> None:  # fmt: skip
         super().__init__()
-        self.trunk = build_trunk(pretrained=pretrained)
-        for part in (self.trunk._conv_stem, self.trunk._bn0, *self.trunk._blocks[:FROZEN_BLOCKS]):
-            part.requires_grad_(not pretrained)
-        self.lateral = nn.ModuleList(nn.Conv2d(channels, width, 1) for channels in TAPS.values())
+        self.trunk = None if frozen else build_trunk(pretrained=pretrained)
+        if self.trunk is not None:
+            for part in (self.trunk._conv_stem, self.trunk._bn0, *self.trunk._blocks[:FROZEN_BLOCKS]):
+                part.requires_grad_(not pretrained)
+        tapped = [dinov2.WIDTH * len(dinov2.TAPPED)] * len(TAPS) if frozen else TAPS.values()
+        self.lateral = nn.ModuleList(nn.Conv2d(channels, width, 1) for channels in tapped)
         self.merge = nn.ModuleList(_conv_block(width, width) for _ in TAPS)
         self.context = nn.Sequential(_conv_block(width, width), _conv_block(width, width))
         self.again = nn.ModuleList(PyramidPass(width) for _ in range(passes - 1))
@@ -54,7 +62,7 @@ class PyramidNetwork(nn.Module):
     def train(self, mode: bool = True) -> PyramidNetwork:
         """As usual, but the trunk keeps ImageNet's batch statistics: half the time of a backward pass on a CPU."""
         super().train(mode)
-        for module in self.trunk.modules():
+        for module in self.trunk.modules() if self.trunk is not None else ():
             if isinstance(module, nn.BatchNorm2d):
                 module.eval()
         return self
@@ -86,17 +94,32 @@ class PyramidNetwork(nn.Module):
 
     def _run(self, image: Tensor, *, with_heads: bool) -> Outputs:
         x = (image - self.mean) / self.std  # (B, 3, H, W)
-        # a CPU gains from bf16 in dense 3 x 3 convolutions and loses in the trunk's depthwise ones; a GPU gains in all
-        with self._autocast(image, image.device.type != "cpu"):
-            features = compute_taps(self.trunk, x if self.detail is None else F.avg_pool2d(x, 2))
+        taps = self._compute_taps(x)
         with self._autocast(image):
-            features, finer = [lateral(f) for lateral, f in zip(self.lateral, features, strict=True)], []
+            features, finer = [lateral(f) for lateral, f in zip(self.lateral, taps, strict=True)], []
+            if self.trunk is None:
+                features = self._spread(features, x.shape[-2:])
             if self.detail is not None:
                 finer = self._find_detail(x)
                 features[0] = features[0] + _resize(finer[-1], features[0])
             levels = self._decode(features)
             said = self.heads(levels[-1], levels[0], finer[-2::-1]) if with_heads else ()
         return Outputs(self.head(levels[-1].float()), *said)
+
+    def _compute_taps(self, x: Tensor) -> list[Tensor]:
+        """The trunk's features of each level, the finest first."""
+        if self.trunk is None:
+            dtype = torch.bfloat16 if self.reduced_precision else torch.float32
+            return [dinov2.compute_features(x, 2 * self.stride, dtype=dtype)] * len(TAPS)
+        # a CPU gains from bf16 in dense 3 x 3 convolutions and loses in the trunk's depthwise ones; a GPU gains in all
+        with self._autocast(x, x.device.type != "cpu"):
+            return compute_taps(self.trunk, x if self.detail is None else F.avg_pool2d(x, 2))
+
+    def _spread(self, features: list[Tensor], size: tuple[int, int]) -> list[Tensor]:
+        """Features of one grid at the levels' own, of images of ``size`` (height, width)."""
+        grids = [[math.ceil(side // self.stride / 2**level) for side in size] for level in range(len(features))]
+        return [F.interpolate(f, grid, mode="bilinear", align_corners=False) if grid[0] >= f.shape[-2]
+                else F.adaptive_avg_pool2d(f, grid) for f, grid in zip(features, grids, strict=True)]  # fmt: skip
 
     def _find_detail(self, x: Tensor) -> list[Tensor]:
         """What the light branch finds after each of its convolutions, the finest first."""
@@ -245,10 +268,10 @@ def build_network(
 ) -> PyramidNetwork | ResNet34Network:  # fmt: skip
     """The network of a name in `NETWORKS` with D channels for each of 1 or 2 roles; ValueError for another name.
 
-    ``pretrained`` starts lite0 from ImageNet; resnet34 does from the file ``trunk_weights`` where one is given.
+    ``pretrained`` starts lite0's trunk from ImageNet; resnet34 does from the file ``trunk_weights`` where one is given.
     """
     if name in PASSES:
-        parts = {"passes": PASSES[name], "detail": name in DETAILED, "heads": heads}
+        parts = {"passes": PASSES[name], "detail": name in DETAILED, "heads": heads, "frozen": name in FROZEN}
         return PyramidNetwork(descriptor_dim, roles=roles, pretrained=pretrained, **parts)
     if name == "resnet34":
         network = ResNet34Network(descriptor_dim, roles=roles)

@@ -47,7 +47,7 @@ from mmgsd.measure.evaluation import (
 from mmgsd.parameters import read_scheduler
 from mmgsd.paths import Paths, find_root
 
-TABLES = ("budget", "robustness")  # studies with a file of their own, of the preset's models under their rows' names
+TABLES = ("budget", "robustness", "backbones")  # studies with a file of their own, of models under their rows' names
 VALIDATIONS = 8  # RMSE on held-out simulations, in a model's log
 
 Task = TrainConfig | tuple[str, str]  # a model to train and ask, or an object and a baseline to ask

@@ -5,8 +5,8 @@
     python -m mmgsd.measure.shipped robustness --photographs FOLDER    the models of that study, once they are trained
 
 A row a name: of weights in data/weights; of a baseline, which is asked about each object with the true masks, and in
-photographs with those that the shipped weights see; or of each model of the study `STUDY` of the preset `paper`, or of
-another with so many steps each (--preset quick --steps 300), which is asked about that preset's images. How modes are
+photographs with those that the shipped weights see; or of each model of a study of `STUDIES` of the preset `paper`,
+or of another with so many steps each (--preset quick --steps 300), which is asked about that preset's images. How modes are
 read (`mmgsd.match.mixture.Reading`) is the weights' own, unless the name says another after an @. The test images of
 the presets `SETS`, or of that one, have to be rendered. Tables of answers are kept, so that a killed call goes on.
 """
@@ -52,7 +52,7 @@ from mmgsd.measure.uncertainty import (
 )
 from mmgsd.paths import Paths, find_root
 
-STUDY = "robustness"
+STUDIES = ("robustness", "backbones")
 SETS = ("paper", "workspace")  # presets whose test images are asked about
 LEVEL = 0.9  # of the radii whose promise is checked
 HEAD_PAIRS = 100  # of images whose modes are judged
@@ -183,18 +183,19 @@ def measure_baseline(
 
 
 def measure_study(
-    root: Path, preset: Preset, *, steps: int = 0, photographs: Path | None = None
+    study: str, root: Path, preset: Preset, *, objects: Sequence[str] = (), steps: int = 0,
+    photographs: Path | None = None,
 ) -> dict[str, dict[str, Any]]:
-    """The rows of the models of `STUDY`, {object-row: as `measure_weights`, with the preset and the ``steps`` of each}.
+    """The rows of a study's models of some ``objects`` (all), {object-row: as `measure_weights`, with the preset and the ``steps`` of each}.
 
     FileNotFoundError where one is not trained yet.
     """
     paths = Paths(root, preset.name)
-    models = {f"{o}-{key}": m for o in OBJECTS for key, m in configure_study(preset, o, STUDY, steps=steps).items()}
+    models = {f"{o}-{key}": m for o in objects or OBJECTS for key, m in configure_study(preset, o, study, steps=steps).items()}
     files = {key: paths.model(model) / WEIGHTS for key, model in models.items()}
     missing = [str(file) for file in files.values() if not file.is_file()]
     if missing:
-        asked = f"{preset.name} --study {STUDY}" + (f" --steps {steps}" if steps else "")
+        asked = f"{preset.name} --study {study}" + (f" --steps {steps}" if steps else "")
         raise FileNotFoundError(f"{missing[0]} does not exist: run python -m mmgsd.measure.matrix {asked}")
     how = {"photographs": photographs, "presets": (preset.name, preset.cluttered)}
     return {key: measure_weights(key, root, weights=file, **how) | {"preset": preset.name, "steps": models[key].steps}
@@ -208,9 +209,10 @@ def _measure(name: str, root: Path, args: argparse.Namespace) -> dict[str, dict[
         return {f"{object}-{name}": measure_baseline(name, object, root, **how) for object in OBJECTS}
     if "@" in name:
         return {name: measure_read(name, root, presets=() if args.photographs_alone else SETS, **how)}
-    if name != STUDY:
+    if name not in STUDIES:
         return {name: measure_weights(name, root, **how)}
-    return measure_study(root, load_preset(args.preset), steps=args.steps, **how)
+    objects = (args.object,) if args.object else ()
+    return measure_study(name, root, load_preset(args.preset), objects=objects, steps=args.steps, **how)
 
 
 def main() -> None:
@@ -220,14 +222,15 @@ def main() -> None:
         "names",
         nargs="+",
         metavar="NAME",
-        help=f"weights in data/weights, alone or with @POWER,SHARPNESS, {', '.join(BASELINES)}, or {STUDY}",
+        help=f"weights in data/weights, alone or with @POWER,SHARPNESS, {', '.join((*BASELINES, *STUDIES))}",
     )
     parser.add_argument("--photographs", type=Path, metavar="FOLDER", help="marked photographs, with index.json")
     parser.add_argument(
         "--photographs-alone", action="store_true", help="of names with an @, leave the renders out: they take longest"
     )
-    parser.add_argument("--preset", default=SETS[0], choices=tuple(PRESETS), help=f"whose {STUDY} (default: {SETS[0]})")
-    parser.add_argument("--steps", type=int, default=0, help=f"of each model of {STUDY} (default: the study's own)")
+    parser.add_argument("--preset", default=SETS[0], choices=tuple(PRESETS), help=f"of the study (default: {SETS[0]})")
+    parser.add_argument("--steps", type=int, default=0, help="of each model of a study (default: the study's own)")
+    parser.add_argument("--object", default="", choices=OBJECTS, help="of a study's models those of one object")
     args = parser.parse_args()
     root, args.steps = find_root(), read_count("--steps", args.steps)
     out = root / "data" / "results" / RESULTS

@@ -98,7 +98,7 @@ def test_a_study_of_another_preset_is_asked_about_its_own_images(root: Path, mon
         folder.mkdir(parents=True)
         shutil.copy(root / "w.safetensors", folder / "weights.safetensors")
     monkeypatch.setattr(shipped, "measure_weights", lambda name, root, **how: asked.append(how["presets"]) or {})
-    rows = measure_study(root, quick, steps=7)
+    rows = measure_study("robustness", root, quick, steps=7)
     assert list(rows) == [f"cloth-{name}" for name in ("mmgsd", "mmgsd_workspace", "mmgsd_clutter", "mmgsd_heads")]
     assert set(asked) == {("quick", "workspace_quick")}
     assert rows["cloth-mmgsd"] == {"preset": "quick", "steps": 7}
