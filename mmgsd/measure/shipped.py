@@ -6,9 +6,9 @@
 
 A row a name: of weights in data/weights; of a baseline, which is asked about each object with the true masks, and in
 photographs with those that the shipped weights see; or of each model of a study of `STUDIES` of the preset `paper`,
-or of another with so many steps each (--preset quick --steps 300), which is asked about that preset's images. How modes are
-read (`mmgsd.match.mixture.Reading`) is the weights' own, unless the name says another after an @. The test images of
-the presets `SETS`, or of that one, have to be rendered. Tables of answers are kept, so that a killed call goes on.
+or of another with so many steps each (--preset quick --steps 300), which is asked about that preset's images. How modes
+are read (`mmgsd.match.mixture.Reading`) is the weights' own, unless the name says another after an @. The test images
+of the presets `SETS`, or of that one, have to be rendered. Tables of answers are kept, so that a killed call goes on.
 """
 
 from __future__ import annotations
@@ -186,12 +186,15 @@ def measure_study(
     study: str, root: Path, preset: Preset, *, objects: Sequence[str] = (), steps: int = 0,
     photographs: Path | None = None,
 ) -> dict[str, dict[str, Any]]:
-    """The rows of a study's models of some ``objects`` (all), {object-row: as `measure_weights`, with the preset and the ``steps`` of each}.
+    """The rows of a study's models, those of some ``objects`` where they are named.
+
+    {object-row: as `measure_weights`, with the preset and the ``steps`` of each}.
 
     FileNotFoundError where one is not trained yet.
     """
     paths = Paths(root, preset.name)
-    models = {f"{o}-{key}": m for o in objects or OBJECTS for key, m in configure_study(preset, o, study, steps=steps).items()}
+    keyed = {name: configure_study(preset, name, study, steps=steps) for name in objects or OBJECTS}
+    models = {f"{name}-{key}": model for name, rows in keyed.items() for key, model in rows.items()}
     files = {key: paths.model(model) / WEIGHTS for key, model in models.items()}
     missing = [str(file) for file in files.values() if not file.is_file()]
     if missing:
