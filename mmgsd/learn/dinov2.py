@@ -97,9 +97,9 @@ def load_backbone(device: torch.device, dtype: torch.dtype = torch.float32) -> V
 def compute_features(x: Tensor, stride: int, *, dtype: torch.dtype = torch.float32) -> Tensor:
     """Features (B, 3 * 384, H / stride, W / stride) of normalised images (B, 3, H, W), without gradients.
 
-    They are resized so that a patch is ``stride`` px of theirs; sides that are no multiples of it are rounded to one.
+    They are resized so that a patch is ``stride`` px of theirs; sides, of at least ``stride``, are rounded to patches.
     """
-    size = [PATCH * max(1, round(side / stride)) for side in x.shape[-2:]]
+    size = [PATCH * ((side + stride // 2) // stride) for side in x.shape[-2:]]
     with torch.autocast(x.device.type, enabled=False):
         x = F.interpolate(x.float(), size, mode="bilinear", align_corners=False)
         return load_backbone(x.device, dtype)(x)

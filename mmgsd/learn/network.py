@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 
@@ -116,10 +116,13 @@ class PyramidNetwork(nn.Module):
             return compute_taps(self.trunk, x if self.detail is None else F.avg_pool2d(x, 2))
 
     def _spread(self, features: list[Tensor], size: tuple[int, int]) -> list[Tensor]:
-        """Features of one grid at the levels' own, of images of ``size`` (height, width)."""
-        grids = [[math.ceil(side // self.stride / 2**level) for side in size] for level in range(len(features))]
-        return [F.interpolate(f, grid, mode="bilinear", align_corners=False) if grid[0] >= f.shape[-2]
-                else F.adaptive_avg_pool2d(f, grid) for f, grid in zip(features, grids, strict=True)]  # fmt: skip
+        """Features of the second level's grid at each level's own, of images of ``size`` (height, width)."""
+        levels = [_resize_to(features[0], [side // self.stride for side in size])]
+        for halvings, level in enumerate(features[1:]):
+            for _ in range(halvings):  # between four cells: their mean
+                level = _resize_to(level, [(side + 1) // 2 for side in level.shape[-2:]])
+            levels.append(level)
+        return levels
 
     def _find_detail(self, x: Tensor) -> list[Tensor]:
         """What the light branch finds after each of its convolutions, the finest first."""
@@ -356,7 +359,11 @@ def _conv_block(inputs: int, outputs: int, *, stride: int = 1) -> nn.Sequential:
 
 
 def _resize(x: Tensor, like: Tensor) -> Tensor:
-    return F.interpolate(x, like.shape[-2:], mode="bilinear", align_corners=False)
+    return _resize_to(x, like.shape[-2:])
+
+
+def _resize_to(x: Tensor, size: Sequence[int]) -> Tensor:
+    return F.interpolate(x, size, mode="bilinear", align_corners=False)
 
 
 def _make_head(width: int, descriptor_dim: int, roles: int) -> nn.Module:
