@@ -122,6 +122,7 @@ MODELS = (
           {"network": "lite0x2fine", "optimiser": "muon", "input_px": times(2), "roundness": 0.05, "heads": True,
            "clutter": True, "also": "workspace"}, ("backbones",), "EfficientNet-Lite0"),
     Model("dinov2s", "DINOv2 ViT-S/14, frozen", "light", {"network": "dinov2s"}, ("backbones",), "DINOv2 ViT-S"),
+    Model("recipe", "MMGSD, one recipe, until done", "dinov2s", {"steps": 20000}, ("recipe",), "MMGSD, done"),
     # what each part of the shipped models' training brings, one after another
     Model("mmgsd_workspace", "MMGSD, workspace renders too", "mmgsd", {"also": "workspace"}, ("robustness",),
           "+ workspace"),
@@ -135,6 +136,7 @@ UNTRAINED = (
     Model("akaze", "AKAZE", "", studies=("hand_made",), colour="#332288"),
     Model("daisy", "DAISY", "", studies=("hand_made",), colour="#E69F00"),
     Model("imagenet", "ImageNet features", "", studies=("hand_made",), colour="#117733"),
+    Model("dinov2", "DINOv2 features", "", studies=("hand_made",), colour="#44AA99"),
     Model("random", "random points", "", studies=("chance",), short="Random points", colour="#9A9A9A"),
     Model("centre", "object's centre", "", studies=("chance",), short="Object centre", colour="#404040"),
 )
@@ -142,7 +144,8 @@ ROWS = {row.name: row for row in (*MODELS, *UNTRAINED)}
 SHIPPED = {"shipped": "", "mmgsd": "-paper", "spcl": "-spcl"}  # row: what its files' names in data/weights end with
 SMALL = ("symmetry", "budget", "sigma", "fixes", "robustness", "backbones")  # studies of the equal, smaller budget
 RUN = ("first", "symmetry", "budget", "sigma", "main")  # studies that are run unless one is named, in this order
-STUDIES = (*RUN, "robustness", "backbones", "shipped")  # on a preset's own images and one seed: not "fixes" and "seeds"
+# on a preset's own images and one seed: not "fixes" and "seeds"
+STUDIES = (*RUN, "robustness", "backbones", "recipe", "shipped")
 
 
 def list_rows(study: str) -> list[Model]:

@@ -1,5 +1,5 @@
 """What one would pick instead, asked the same dense question as a trained network: hand-made descriptors, SIFT, ORB and
-others, and dense features of any network by nearest neighbours, such as ImageNet's (as DIFT or DINO are used).
+others, and dense features of any network by nearest neighbours, such as ImageNet's or DINOv2's.
 
 A descriptor is computed at each source pixel and at each cell of a regular grid on the target's object; a softmax over
 their distances is the heatmap from which :mod:`mmgsd.match.matcher` reads the modes. Every window is 60 to 80 px wide,
@@ -23,12 +23,13 @@ from torch import Tensor
 
 from mmgsd.checks import check_choice
 from mmgsd.images import check_pixels, check_question
-from mmgsd.match.features import Extractor, extract_imagenet, sample_features
+from mmgsd.match.features import Extractor, extract_dinov2, extract_imagenet, sample_features
 from mmgsd.match.match import Match
 from mmgsd.match.matcher import make_match
 from mmgsd.match.mixture import check_modes
 
-BASELINES = ("sift", "orb", "akaze", "daisy", "imagenet")
+EXTRACTORS: dict[str, Extractor] = {"imagenet": extract_imagenet, "dinov2": extract_dinov2}
+BASELINES = ("sift", "orb", "akaze", "daisy", *EXTRACTORS)
 BINARY = ("orb", "akaze")  # compared by Hamming distance
 STRIDE_PX = 16  # between the candidates on the object: about a cell of the trained networks
 SHARPNESS = 2.0  # logits fall by this where the squared distance grows by its std over the object
@@ -98,7 +99,7 @@ class BaselineMatcher(FeatureMatcher):
 
     def __init__(self, method: str, *, modes: int = 1) -> None:
         check_choice("method", method, BASELINES)
-        super().__init__(extract_imagenet, modes=modes)
+        super().__init__(EXTRACTORS.get(method, extract_imagenet), modes=modes)
         self.method = method
 
     def describe(self, image: np.ndarray, xy: np.ndarray) -> np.ndarray:
@@ -158,8 +159,8 @@ def compute_descriptors(image: np.ndarray, xy: np.ndarray, *, method: str) -> np
     check_choice("method", method, BASELINES)
     _check_image("image", image)
     xy = check_pixels(xy, image.shape[1::-1], image="the image")
-    if method == "imagenet":
-        return sample_features(extract_imagenet(image), xy, image.shape[1::-1])
+    if method in EXTRACTORS:
+        return sample_features(EXTRACTORS[method](image), xy, image.shape[1::-1])
     grey = np.pad(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), PAD_PX, mode="symmetric")
     if not len(xy):
         return np.zeros((0, 1), np.float32)

@@ -12,10 +12,12 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from mmgsd.learn import dinov2
 from mmgsd.learn.network import IMAGENET_MEAN, IMAGENET_STD, build_trunk, compute_taps, sample_descriptors
 
 Extractor = Callable[[np.ndarray], Any]  # (H, W, 3) uint8 -> (D, h, w)
-LONGEST_PX, MULTIPLE_PX = 640, 32  # of what EfficientNet-Lite0 is given: about the sizes it was made for, and up
+LONGEST_PX = 640  # of what a network is given
+MULTIPLE_PX = 32  # that EfficientNet-Lite0's sides are
 TAP = 2  # of strides 4, 8, 16 and 32 px, that of 16: on the sample it finds the most
 
 
@@ -39,10 +41,21 @@ def sample_features(features: Any, xy: np.ndarray, size: tuple[int, int]) -> np.
 def extract_imagenet(image: np.ndarray) -> Tensor:
     """Features (D, h, w) of EfficientNet-Lite0 as ImageNet taught it, of an image (H, W, 3) uint8."""
     scale = min(1, LONGEST_PX / max(image.shape[:2]))
-    size = [max(1, round(side * scale / MULTIPLE_PX)) * MULTIPLE_PX for side in image.shape[1::-1]]
+    return compute_taps(_load_trunk(), _normalise(image, scale, MULTIPLE_PX))[TAP][0]
+
+
+@torch.inference_mode()
+def extract_dinov2(image: np.ndarray) -> Tensor:
+    """Features (384, h, w) of DINOv2's last block for 46 patches along the longer side of an image (H, W, 3) uint8."""
+    x = _normalise(image, LONGEST_PX / max(image.shape[:2]), dinov2.PATCH)
+    return dinov2.compute_features(x, dinov2.PATCH)[0, -dinov2.WIDTH :]
+
+
+def _normalise(image: np.ndarray, scale: float, multiple: int) -> Tensor:
+    """(1, 3, h, w) of an image, scaled, both sides a ``multiple`` of px, as ImageNet's networks are given images."""
+    size = [max(1, round(side * scale / multiple)) * multiple for side in image.shape[1::-1]]
     x = torch.from_numpy(cv2.resize(image, size, interpolation=cv2.INTER_AREA)).permute(2, 0, 1)[None].float() / 255
-    x = (x - torch.tensor(IMAGENET_MEAN).view(3, 1, 1)) / torch.tensor(IMAGENET_STD).view(3, 1, 1)
-    return compute_taps(_load_trunk(), x)[TAP][0]
+    return (x - torch.tensor(IMAGENET_MEAN).view(3, 1, 1)) / torch.tensor(IMAGENET_STD).view(3, 1, 1)
 
 
 @cache

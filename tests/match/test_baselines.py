@@ -5,6 +5,7 @@ import torch
 
 from mmgsd.match.baselines import (
     BASELINES,
+    EXTRACTORS,
     BaselineMatcher,
     FeatureMatcher,
     compute_baseline_heatmap,
@@ -106,7 +107,7 @@ def test_no_point_is_dropped_at_the_border(method, image):
     assert np.isfinite(descriptors).all()
 
 
-@pytest.mark.parametrize("method", [m for m in BASELINES if m != "imagenet"])  # a network sees the border
+@pytest.mark.parametrize("method", [m for m in BASELINES if m not in EXTRACTORS])  # a network sees the border
 def test_a_plain_image_gives_a_uniform_heatmap(method, image, mask, xy):
     plain = np.full_like(image, 90)
     heatmap, _ = compute_baseline_heatmap(plain, plain, xy[:3], mask, method=method, stride=STRIDE)
