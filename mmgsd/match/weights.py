@@ -71,6 +71,8 @@ def _check_file(path: Path) -> None:
         raise ValueError(f"{path} is a folder: give the path of a safetensors file in it")
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist: train a model, or give the path of its weights")
+    if not path.is_file():  # a pipe would be read up in being looked at
+        raise ValueError(f"{path} is no regular file: give the path of a safetensors file")
     open(path, "rb").close()  # PermissionError names the file
 
 
