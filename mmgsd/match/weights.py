@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -78,6 +79,8 @@ def _check_file(path: Path) -> None:
 
 def _describe_damage(path: Path, error: Exception) -> str:
     """Why it is no safetensors file; asked only once it is known to be none, for one may begin with the same bytes."""
+    if str(path).encode(errors="replace") != os.fsencode(path):
+        return f"{path} must have a name in UTF-8, its folders' names, too: rename it"
     with open(path, "rb") as file:
         start = file.read(4)
     if start.startswith(PICKLES):

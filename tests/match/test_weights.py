@@ -145,6 +145,12 @@ def test_a_folder_is_no_file(tmp_path: Path, read: object) -> None:
         read(tmp_path)
 
 
+def test_a_name_that_cannot_be_read_is_not_called_damage(matcher: Matcher, tmp_path: Path) -> None:
+    path = save_weights(tmp_path / "w.safetensors", matcher.network)
+    with pytest.raises(ValueError, match="must have a name in UTF-8"):
+        load(path.rename(tmp_path / os.fsdecode(b"caf\xe9.safetensors")))
+
+
 def test_a_pipe_is_no_file_of_weights(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")  # to be opened, it would wait for who writes into it
     with pytest.raises(ValueError, match="pipe is no regular file"):
