@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import sys
 from pathlib import Path
 
 import mmgsd
 from mmgsd import cli
-from mmgsd.command import describe_error
+from mmgsd.command import describe_error, print_anywhere
 from mmgsd.config import MAX_MODES
 
 EXAMPLE = "example: python -m mmgsd match towel1.jpg towel2.jpg --xy 212,148 --weights FILE --out match.png"
@@ -22,8 +23,9 @@ def main(arguments: list[str] | None = None) -> None:
     Exits with 2 and one sentence for a wrong argument or a file that does not do, with 1 where the result cannot be
     written or one of many images could not be answered, and with 130 after Ctrl-C.
     """
+    print_anywhere()
     parser = make_parser()
-    args = parser.parse_args(arguments)
+    args = parser.parse_args(_join_negative(sys.argv[1:] if arguments is None else arguments))
     try:
         args.run(args)
     except KeyboardInterrupt:
@@ -36,6 +38,17 @@ def main(arguments: list[str] | None = None) -> None:
         parser.exit(2, f"error: {describe_error(error)}\n")
     except (OSError, RuntimeError, MemoryError) as error:
         parser.exit(1, f"error: {cli.say_error(error)}\n")
+
+
+def _join_negative(words: list[str]) -> list[str]:
+    """``--xy -0.4,3`` as ``--xy=-0.4,3``: argparse takes what begins with a minus for an option."""
+    joined = []
+    for word in words:
+        if joined and joined[-1].startswith("--") and re.match(r"-\.?\d", word):
+            joined[-1] += f"={word}"
+        else:
+            joined.append(word)
+    return joined
 
 
 def _say_kept(args: argparse.Namespace) -> str:
@@ -80,15 +93,15 @@ def _add_measures(commands: argparse._SubParsersAction) -> None:
 
 
 def _add_match(match: argparse.ArgumentParser) -> None:
-    match.add_argument("image0", type=Path, help="the image that the pixels are in")
-    match.add_argument("image1", type=Path, help="the image to find them in, or a folder of such images")
+    match.add_argument("image0", type=_parse_image, help="the image that the pixels are in, - for what is piped in")
+    match.add_argument("image1", type=_parse_image, help="the image to find them in, or a folder of such images")
     match.add_argument("--xy", type=_parse_pixel, action="append", required=True, metavar="X,Y",
                        help="column,row px in image0, the top left one is 0,0; may be given several times")  # fmt: skip
     match.add_argument("--n", type=_parse_number, metavar="N", help="modes, or auto; default: as many as its symmetry")
     match.add_argument("--joint", action="store_true",
                        help="answer all pixels together: the modes of one number belong together")  # fmt: skip
     for name in ("mask0", "mask1"):
-        match.add_argument(f"--{name}", type=Path, metavar="FILE",
+        match.add_argument(f"--{name}", type=_parse_image, metavar="FILE",
                            help=f"an image as large as image{name[-1]}, brighter than half on the object")  # fmt: skip
     match.add_argument("--out", type=_parse_picture, metavar="FILE", help="draw the answer (png, jpg, pdf or svg)")
     match.add_argument("--pictures", type=Path, metavar="FOLDER", help="draw the answer of each image of a folder")
@@ -99,7 +112,7 @@ def _add_match(match: argparse.ArgumentParser) -> None:
 
 def _add_fold(fold: argparse.ArgumentParser) -> None:
     fold.add_argument("demonstration", type=Path, metavar="DEMO.json", help="see docs/folding.md")
-    fold.add_argument("image", type=Path, help="a picture of the present state")
+    fold.add_argument("image", type=_parse_image, help="a picture of the present state")
     fold.add_argument("--look", type=int, default=0, help="which of the demonstration's looks (default: 0, the first)")
     fold.add_argument("--chosen", default="agree", choices=("agree", "best", "joint"),
                       help="which like modes are taken: those that one motion agrees with (the default), each pixel's "
@@ -111,7 +124,7 @@ def _add_fold(fold: argparse.ArgumentParser) -> None:
 
 
 def _add_segment(segment: argparse.ArgumentParser) -> None:
-    segment.add_argument("image", type=Path, help="the image to look at")
+    segment.add_argument("image", type=_parse_image, help="the image to look at")
     segment.add_argument("out", type=Path, help="the mask to write, .png: brighter than half on the object")
     segment.set_defaults(run=cli.segment)
 
@@ -128,6 +141,10 @@ def _add_measure(measure: argparse.ArgumentParser) -> None:
 def _add_export(export: argparse.ArgumentParser) -> None:
     export.add_argument("out", type=Path, help="the file to write, .onnx")
     export.set_defaults(run=cli.export)
+
+
+def _parse_image(text: str) -> Path:
+    return Path("/dev/stdin" if text == "-" else text)
 
 
 def _parse_pixel(text: str) -> tuple[float, float]:

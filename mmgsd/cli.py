@@ -21,6 +21,7 @@ from mmgsd.images import check_pixels, list_images, read_mask
 from mmgsd.match.describe import describe_answer, format_query
 
 DPI = 150  # of a picture
+NAMED = 10  # of what is left out of a folder
 COLUMNS = (
     "image1", "x", "y", "mode", "x1", "y1", "weight", "spread_px", "confidence", "visible", "entropy", "outside",
     "on_object", "absent", "said",
@@ -66,19 +67,28 @@ def _match_folder(args: argparse.Namespace) -> None:
     matcher, failed = mmgsd.load(args.weights), []
     matcher.compute_input_size(image0, "image0")
     bar = tqdm(paths, desc="match", unit="image", disable=not sys.stderr.isatty())
+    _say_left_out(args.image1, paths)
     named, frames = itertools.tee(_read_readable(matcher, bar, failed))
     answers = matcher.match_many(((image0, image1, args.xy) for _, image1 in frames), n=args.n, joint=args.joint)
+    plain = len({path.stem.casefold() for path in paths}) == len(paths)  # a.png and a.jpg are two pictures
     with _writing_rows(args.csv) if args.csv else nullcontext() as table:
         for (path, _), answer in zip(named, answers, strict=True):
             described = describe_answer(answer)
             if table:
                 table.writerows(_list_rows(path.name, described))
             if args.pictures:
-                draw_answer(answer, args.pictures / f"{path.name}.png")
+                draw_answer(answer, args.pictures / f"{path.stem if plain else path.name}.png")
             with tqdm.external_write_mode():
                 _print_answer(path.name, described, as_json=args.json)
     if failed:
         raise RuntimeError(f"{len(failed)} of {len(paths)} images could not be answered for: {', '.join(failed)}")
+
+
+def _say_left_out(folder: Path, paths: list[Path]) -> None:
+    names = [path.name for path in sorted({*folder.iterdir()}.difference(paths)) if not path.name.startswith(".")]
+    if names:
+        more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+        print(f"left out, as they do not end as images do: {', '.join(names[:NAMED])}{more}", file=sys.stderr)
 
 
 def _read_readable(matcher: Any, paths: Any, failed: list[str]) -> Iterator[tuple[Path, Any]]:
@@ -115,7 +125,7 @@ def _list_rows(name: str, described: list[dict[str, Any]]) -> Iterator[dict[str,
 @contextmanager
 def _writing_rows(path: Path) -> Iterator[csv.DictWriter]:
     """A writer of `COLUMNS` to a file that appears whole or not at all."""
-    with writing(path) as aside, open(aside, "w", newline="", encoding="utf-8") as file:
+    with writing(path) as aside, open(aside, "w", newline="", encoding="utf-8", errors="backslashreplace") as file:
         table = csv.DictWriter(file, COLUMNS, restval="")
         table.writeheader()
         yield table

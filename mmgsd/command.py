@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import os
 import sys
 from collections.abc import Callable
@@ -18,6 +19,7 @@ def run_command(main: Callable[[], None], *, kept: str = KEPT) -> None:
 
     MMGSD_TRACEBACK=1 in the environment lets the traceback through.
     """
+    print_anywhere()
     if os.environ.get("MMGSD_TRACEBACK", "0") not in ("", "0"):
         main()
         return
@@ -27,6 +29,19 @@ def run_command(main: Callable[[], None], *, kept: str = KEPT) -> None:
         _leave(f"stopped: {kept}", 130)
     except Exception as error:
         _leave(f"error: {describe_error(error)}", 2)
+
+
+def print_anywhere() -> None:
+    """Let a character that the output's encoding lacks be spelled, +/- or by its number, instead of ending the run."""
+    codecs.register_error("mmgsd.spell", _spell)
+    for stream in (sys.stdout, sys.stderr):
+        if getattr(stream, "errors", "") == "strict" and hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="mmgsd.spell")
+
+
+def _spell(error: UnicodeError) -> tuple[str, int]:
+    lacking = error.object[error.start : error.end].replace("±", "+/-")
+    return lacking.encode("ascii", "backslashreplace").decode(), error.end
 
 
 def describe_error(error: BaseException) -> str:

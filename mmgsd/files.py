@@ -1,21 +1,29 @@
 """The one place that writes files whole or not at all, locks folders, and removes what is the project's own.
 
-A file is written under a temporary name beside its place, flushed to the disk and renamed. Temporary names carry the
-process that wrote them, so that what a killed one left behind is known, and removed by the next that writes there.
+A file is written under a temporary name beside its place, flushed to the disk and renamed; through a link, the file
+that it leads to. What is no regular file (a device, a pipe) is never replaced: it gets the finished bytes. Temporary
+names carry the process that wrote them, so that what a killed one left behind is known, and removed by the next that
+writes there.
 """
 
 from __future__ import annotations
 
+import errno
+import glob
+import hashlib
 import json
 import os
 import re
 import shutil
 import socket
+import stat
+import tempfile
 import time
 import uuid
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -25,6 +33,8 @@ except ImportError:  # Windows: folders are not locked there
     fcntl = None
 
 ASIDE = re.compile(r"\.(?P<name>.+)\.(?P<host>[^.]*)-(?P<pid>\d+)-[0-9a-f]{8}\.(aside|old)")
+LONGEST = 48  # bytes of a name, or of a host's, in a temporary name: some file systems take 143 in all
+UNSUPPORTED = {errno.ENOSYS, errno.ENOLCK, errno.EINVAL, errno.EOPNOTSUPP}  # file systems without locks, or fsync
 
 
 class LockedError(RuntimeError):
@@ -47,20 +57,62 @@ def writing(path: Path | str) -> Iterator[Path]:
     """
     path = Path(path)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        remove_leftovers(path.parent, path.name)
-        aside = name_aside(path)
+        direct = _is_written_directly(path)
+        target = Path(tempfile.gettempdir(), path.name) if direct else Path(os.path.realpath(path))
+        target.parent.mkdir(parents=True, exist_ok=True)
+        remove_leftovers(target.parent, target.name)
+        aside = name_aside(target)
         try:
             yield aside
-            _flush(aside)
-            os.replace(aside, path)
-            _flush(path.parent)
+            if direct or not _replace(aside, target):
+                _copy_into(aside, path)
         finally:
             aside.unlink(missing_ok=True)
     except OSError as error:
         if str(path) in str(error):
             raise
         raise type(error)(error.errno, f"{error.strerror or error} while writing {path}") from error
+
+
+def _replace(aside: Path, target: Path) -> bool:
+    """Whether a finished file took its place: one mounted by itself, as into a container, cannot be replaced."""
+    _flush(aside)
+    try:
+        os.replace(aside, target)
+    except OSError as error:
+        if error.errno != errno.EBUSY:
+            raise
+        return False
+    _flush(target.parent)
+    return True
+
+
+def _is_written_directly(path: Path) -> bool:
+    """Whether a path is a device, a pipe, or what this process prints to; OSError of a folder or a link to itself."""
+    try:
+        there = os.stat(path)
+    except FileNotFoundError:
+        return False
+    if stat.S_ISDIR(there.st_mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    return not stat.S_ISREG(there.st_mode) or _find_printed(there) is not None
+
+
+def _find_printed(there: os.stat_result) -> int | None:
+    """The number under which this process prints to a file, a terminal or a pipe."""
+    for number in (1, 2):
+        with suppress(OSError):  # a closed one
+            if os.path.samestat(os.fstat(number), there):
+                return number
+    return None
+
+
+def _copy_into(aside: Path, path: Path) -> None:
+    """Add to what is printed, where it is that: opened anew, a file would be written over from its beginning."""
+    printed = _find_printed(os.stat(path))
+    place = path if printed is None else os.dup(printed)
+    with open(aside, "rb") as source, open(place, "wb") as target:
+        shutil.copyfileobj(source, target)
 
 
 def write_bytes(path: Path | str, data: bytes) -> Path:
@@ -90,13 +142,23 @@ def read_json(path: Path | str, *, remedy: str = "remove it, or get it anew") ->
 
 def name_aside(path: Path, kind: str = "aside") -> Path:
     """A temporary name beside ``path`` that no other process, thread or machine takes."""
-    host = re.sub("[^A-Za-z0-9_]", "_", socket.gethostname())
-    return path.with_name(f".{path.name}.{host}-{os.getpid()}-{uuid.uuid4().hex[:8]}.{kind}")
+    return path.with_name(f".{_shorten(path.name)}.{_name_host()}-{os.getpid()}-{uuid.uuid4().hex[:8]}.{kind}")
+
+
+def _shorten(name: str) -> str:
+    """A name, or where it is long a hash in its place: what is put around it must not make it too long."""
+    data = os.fsencode(name)
+    return name if len(data) <= LONGEST else hashlib.sha256(data).hexdigest()[:32]
+
+
+def _name_host() -> str:
+    return _shorten(re.sub("[^A-Za-z0-9_]", "_", socket.gethostname()))
 
 
 def remove_leftovers(folder: Path, name: str = "") -> None:
     """Remove what killed processes of this machine left in ``folder``: of the file ``name``, or of every file."""
-    for path in folder.glob(f".{name or '*'}.*.*"):
+    name = _shorten(name)
+    for path in folder.glob(f".{glob.escape(name) or '*'}.*.*"):
         found = ASIDE.fullmatch(path.name)
         if found and (not name or found["name"] == name) and not _is_running(found["host"], int(found["pid"])):
             _remove(path)
@@ -137,7 +199,7 @@ def replace_folder(finished: Path, folder: Path, is_ours: Callable[[Path], bool]
     os.replace(finished, folder)
     _flush(folder.parent)
     if old:
-        shutil.rmtree(old)
+        _remove(old)
     remove_leftovers(folder.parent, folder.name)
 
 
@@ -154,10 +216,11 @@ def check_ours(folder: Path, is_ours: Callable[[Path], bool]) -> None:
 def locked(folder: Path, doing: str) -> Iterator[None]:
     """Hold a folder, which need not exist, for this process alone; LockedError names who holds it, and ``doing`` what.
 
-    The lock ends with the process, however it ends. It lies beside the folder while it is held: ``.NAME.lock``.
+    The lock ends with the process, however it ends. It lies beside the folder while it is held: ``.NAME.lock``. Where
+    the file system has no locks, a warning says so and nothing is held.
     """
     folder.parent.mkdir(parents=True, exist_ok=True)
-    path = folder.with_name(f".{folder.name}.lock")
+    path = folder.with_name(f".{_shorten(folder.name)}.lock")
     with _take(path) as file:
         if file is None:
             holder = path.read_text("utf-8").strip() if path.is_file() else ""
@@ -184,6 +247,11 @@ def _take(path: Path) -> Iterator[TextIO | None]:
             except BlockingIOError:
                 yield None
                 return
+            except OSError as error:
+                if error.errno not in UNSUPPORTED:
+                    raise
+                _warn_once(f"{path.parent} has no file locks ({error.strerror}): start no second process that writes "
+                           "there")  # fmt: skip
             if not fcntl or (path.exists() and os.fstat(file.fileno()).st_ino == path.stat().st_ino):
                 yield file
                 return
@@ -212,7 +280,7 @@ def saying_what_stays(describe: Callable[[], str]) -> Iterator[None]:
 
 def _is_running(host: str, pid: int) -> bool:
     """Whether the process may be alive: of another machine, and on Windows, that is not known."""
-    if os.name != "posix" or host != re.sub("[^A-Za-z0-9_]", "_", socket.gethostname()):
+    if os.name != "posix" or host != _name_host():
         return True
     try:
         os.kill(pid, 0)
@@ -231,11 +299,26 @@ def _remove(path: Path) -> None:
 
 
 def _flush(path: Path) -> None:
-    """Have the system write a file, or a folder's entries, to the disk."""
+    """Have the system write a file, or a folder's entries, to the disk.
+
+    A warning where the file system cannot, or for a folder: what was renamed in it is whole, and there.
+    """
     if path.is_dir() and os.name != "posix":
         return
-    handle = os.open(path, os.O_RDONLY if os.name == "posix" else os.O_RDWR)  # Windows flushes what may be written
     try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+        handle = os.open(path, os.O_RDONLY if os.name == "posix" else os.O_RDWR)  # Windows flushes what may be written
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+    except OSError as error:
+        if error.errno not in UNSUPPORTED and not path.is_dir():
+            raise
+        folder = path if path.is_dir() else path.parent
+        _warn_once(f"{folder} cannot be flushed to the disk ({error.strerror}): a power cut may lose what was just "
+                   "written there")  # fmt: skip
+
+
+@cache
+def _warn_once(sentence: str) -> None:
+    warnings.warn(sentence, stacklevel=3)

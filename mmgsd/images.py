@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import io
+import os
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -12,27 +16,36 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 
 CHANNELS = (1, 3, 4)  # grey, RGB, RGBA
 MAX_ASPECT = 16  # longer side by shorter side, beyond which too few of the network's cells lie across
-ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".gif", ".heic", ".heif")
+HEIC = (".heic", ".heif")
+NO_PICTURES = {"BUFR", "EPS", "GRIB", "HDF5", "MPEG", "WMF"}  # kinds whose pixels Pillow alone does not read
 LOSSLESS = {"lossless": True, "quality": 20, "method": 0}  # WebP, 25 ms an image; more effort saves a few per cent
 WHITE = 255
 DEEP = 257  # steps of 16 bits to a step of 8: 65535 becomes 255
+OVERSHOOT = 0.01  # beyond [0, 1] that an antialiased or bicubic resize leaves, and that is clipped
 
 
 def read_image(path: Path | str) -> np.ndarray:
     """(H, W, 3) uint8 of an image file, upright as its camera noted.
 
-    16 bits and floats in [0, 1] are scaled to 8 bits; of a file with several pictures the first is read; transparency
-    is left out: what counts are the colours beneath it. FileNotFoundError, PermissionError, or ValueError for a file
-    that is no image, is damaged, or has other values.
+    16 bits and floats in [0, 1] are scaled to 8 bits and rounded; of a file with several pictures the first is read;
+    transparency is left out: what counts are the colours beneath it; a pipe is read to its end. FileNotFoundError,
+    PermissionError, or ValueError for a file that is no image, is damaged, or has other values.
     """
     path = Path(path)
     if path.is_dir():
         raise ValueError(f"{path} is a folder: give the path of an image file in it")
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist: give the path of an image file")
-    if path.stat().st_size == 0:
+    source = path if path.is_file() else io.BytesIO(path.read_bytes())
+    if not (path.stat().st_size if source is path else source.getbuffer().nbytes):
         raise ValueError(f"{path} is empty: get the image anew")
-    return _decode(path, str(path))
+    return _decode(source, str(path))
+
+
+def find_beside(path: Path, name: str) -> Path:
+    """The image that a JSON file at ``path`` names, relative to it, be its folders divided by / or as on Windows."""
+    place = path.parent / name
+    return place if place.exists() else path.parent / name.replace("\\", "/")
 
 
 def read_mask(path: Path | str, shape: tuple[int, int]) -> np.ndarray:
@@ -52,13 +65,20 @@ def read_mask(path: Path | str, shape: tuple[int, int]) -> np.ndarray:
 def list_images(folder: Path | str) -> list[Path]:
     """The image files of a folder, by their names' endings, in the order of their names; ValueError where it has none.
 
-    Hidden files and folders in it are left out.
+    The endings are those of all kinds that `read_image` reads. Hidden files and folders in it are left out.
     """
-    paths = sorted(path for path in Path(folder).iterdir() if path.suffix.lower() in ENDINGS)
+    paths = sorted(path for path in Path(folder).iterdir() if path.suffix.lower() in _list_endings())
     found = [path for path in paths if path.is_file() and not path.name.startswith(".")]
     if not found:
-        raise ValueError(f"{folder} holds no image: its files must end with one of {', '.join(ENDINGS)}")
+        raise ValueError(f"{folder} holds no image: its files must end as images do, with .png, .jpg, .webp, .tif …")
     return found
+
+
+@cache
+def _list_endings() -> set[str]:
+    """Of HEIC too, so that it is said how to get it read, and of MPO, which Pillow opens as JPEG."""
+    known = Image.registered_extensions().items()
+    return {ending for ending, kind in known if kind in Image.OPEN and kind not in NO_PICTURES} | {".mpo", *HEIC}
 
 
 def decode_image(data: bytes, name: str) -> np.ndarray:
@@ -67,13 +87,19 @@ def decode_image(data: bytes, name: str) -> np.ndarray:
 
 
 def _decode(source: Path | io.BytesIO, name: str) -> np.ndarray:
+    with _naming(name), Image.open(source) as image:
+        return _convert(image, name)
+
+
+@contextmanager
+def _naming(name: str) -> Iterator[None]:
+    """Let what Pillow raises about an image become a ValueError that names it, or stay where it names the file."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # what matters of them is an error
-            with Image.open(source) as image:
-                return _convert(ImageOps.exif_transpose(image), name)
+            yield
     except UnidentifiedImageError as error:
-        kind = "a HEIC image, which cannot" if name.lower().endswith((".heic", ".heif")) else "no image that can"
+        kind = "a HEIC image, which cannot" if name.lower().endswith(HEIC) else "no image that can"
         raise ValueError(f"{name} is {kind} be read: save it as PNG, JPEG, WebP or TIFF") from error
     except Image.DecompressionBombError as error:
         raise ValueError(f"{name} has too many pixels ({error}): make it smaller") from error
@@ -88,24 +114,46 @@ class _NamedError(ValueError):
 
 
 def _convert(image: Image.Image, name: str) -> np.ndarray:
-    """(H, W, 3) uint8 of a Pillow image of any mode, palettes, CMYK and 1 bit included."""
-    if image.mode.startswith("I;16"):
+    """(H, W, 3) uint8 of a Pillow image of any mode, palettes, CMYK and 1 bit included, upright as its camera noted."""
+    grey16 = image.mode.startswith("I;16") or (image.format, image.mode) == ("PPM", "I")
+    image = ImageOps.exif_transpose(_round_colours(image))
+    if grey16:
         return _to_channels(_to_bytes(np.asarray(image).astype(np.uint16), name))
     if image.mode in ("F", "I"):
         return _to_channels(_to_bytes(np.asarray(image), name))
     return np.array(image.convert("RGB"))
 
 
+def _round_colours(image: Image.Image) -> Image.Image:
+    """The same picture, colours of 16 bits rounded to 8: Pillow cuts off the lower ones, OpenCV reads them.
+
+    An image that was loaded before, and what the two do not read alike, stays as Pillow has it.
+    """
+    if not any(";16" in str(tile) for tile in getattr(image, "tile", ())) or image.mode not in ("LA", "RGB", "RGBA"):
+        return image
+    import cv2  # only here: the rendering's child processes, which encode images, start faster without
+
+    image.fp.seek(0)
+    deep = cv2.imdecode(np.frombuffer(image.fp.read(), np.uint8), cv2.IMREAD_UNCHANGED)
+    if deep is None or deep.ndim != 3 or not np.array_equal(deep[..., 2::-1] >> 8, image.convert("RGB")):
+        return image
+    rounded = Image.fromarray(_to_bytes(np.ascontiguousarray(deep[..., 2::-1]), ""))
+    rounded.getexif().update(image.getexif())
+    return rounded
+
+
 def to_rgb(image: Any, name: str = "image") -> np.ndarray:
-    """A copy (H, W, 3) uint8 of a grey, RGB or RGBA array, tensor or Pillow image; ValueError names the argument.
+    """A copy (H, W, 3) uint8 of a grey, RGB or RGBA array, tensor or Pillow image, or of a file by its path.
 
     (H, W), (H, W, 1), (H, W, 3) or (H, W, 4) of uint8, uint16 (scaled), bool (black and white) or float in [0, 1].
-    Transparency is left out: what counts are the colours beneath it.
+    Transparency is left out: what counts are the colours beneath it. Pillow images are turned upright, as `read_image`
+    turns files. ValueError names the argument; of a path, errors are those of `read_image`.
     """
     if isinstance(image, Image.Image):
-        return _convert(image, name)
-    if isinstance(image, str | Path):
-        raise ValueError(f"{name} must be an array, got the path {str(image)!r}: read it with mmgsd.read_image")
+        with _naming(name):
+            return _convert(image, name)
+    if isinstance(image, str | os.PathLike):
+        return read_image(image)
     values = _to_array(image, name)
     _check_shape(values, name)
     return _to_channels(_to_bytes(values, name))
@@ -139,7 +187,12 @@ def check_pixels(xy: Any, size: tuple[int, int], *, image: str = "image0") -> np
 
 
 def check_mask(mask: Any, shape: tuple[int, int], name: str) -> np.ndarray:
-    """A copy of a mask (H, W) bool of an image of that ``shape``; ValueError for another, or where it is all False."""
+    """A copy of a mask (H, W) bool of an image of that ``shape``; ValueError for another, or where it is all False.
+
+    A path's file is read as by `read_mask`.
+    """
+    if isinstance(mask, str | os.PathLike):
+        return read_mask(mask, shape)
     values = _to_array(mask, name)
     if values.dtype != bool:
         raise ValueError(f"{name} must be bool, True on the object, got {values.dtype}: compare it, as in mask > 127")
@@ -158,10 +211,12 @@ def check_aspect(size: tuple[int, int], name: str) -> None:
 
 
 def _to_array(values: Any, name: str) -> np.ndarray:
-    """NumPy's view of an array, a list or a tensor, wherever it lies."""
+    """NumPy's view of an array, a list, a tensor, wherever it lies, or a Pillow image, upright."""
     if hasattr(values, "detach"):  # a torch tensor; this module does without torch
         values = values.detach().cpu()
         values = values.float() if str(values.dtype) == "torch.bfloat16" else values
+    if isinstance(values, Image.Image):
+        values = ImageOps.exif_transpose(values)
     try:
         return np.asarray(values)
     except (TypeError, ValueError) as error:
@@ -186,13 +241,14 @@ def _to_bytes(values: np.ndarray, name: str) -> np.ndarray:
         return values
     if kind.kind == "b":
         return values * np.uint8(255)
-    if kind == np.uint16:
+    if kind.kind == "u" and kind.itemsize == 2:  # of either byte order
         return np.rint(values / DEEP).astype(np.uint8)
     if np.issubdtype(kind, np.floating):
         low, high = values.min(), values.max()  # NaN where one is
-        if not 0 <= low <= high <= 1:
-            raise _NamedError(f"{name} of dtype {kind} must lie in [0, 1], got {low} to {high}: divide it by its white")
-        return np.rint(values * 255).astype(np.uint8)
+        if not -OVERSHOOT <= low <= high <= 1 + OVERSHOOT:
+            remedy = "clip it" if -0.5 < low <= high < 1.5 else "divide it by its white"
+            raise _NamedError(f"{name} of dtype {kind} must lie in [0, 1], got {low} to {high}: {remedy}")
+        return np.rint(values.clip(0, 1) * 255).astype(np.uint8)
     range_ = f" from {values.min()} to {values.max()}" if np.issubdtype(kind, np.integer) else ""
     raise _NamedError(f"{name} must be uint8 or float, got {kind}{range_}: scale it to uint8, uint16 or [0, 1]")
 

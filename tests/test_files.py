@@ -1,12 +1,22 @@
 import errno
 import os
+import socket
+import stat
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import pytest
 
 from mmgsd import files
+
+
+def raising(number):
+    def fail(*_, **__):
+        raise OSError(number, os.strerror(number))
+
+    return fail
 
 
 def test_a_file_is_written_whole_or_not_at_all(tmp_path):
@@ -28,6 +38,119 @@ def test_what_a_killed_process_left_is_removed_by_the_next_write_and_a_living_on
     files.write_json(target, {"a": 1})
     assert not left.exists() and living.exists() and others.exists()
     assert files.read_json(target) == {"a": 1}
+
+
+@pytest.mark.parametrize("begin", ["first", None])
+def test_a_link_stays_and_what_it_leads_to_is_written(tmp_path, begin):
+    real, link = tmp_path / "real" / "a.txt", tmp_path / "link.txt"
+    real.parent.mkdir()
+    (tmp_path / "middle").symlink_to(real)
+    link.symlink_to("middle")
+    if begin:
+        real.write_text(begin)
+    files.write_text(link, "second")
+    assert link.is_symlink() and (tmp_path / "middle").is_symlink() and real.read_text() == "second"
+    assert os.listdir(real.parent) == ["a.txt"]
+
+
+def test_what_cannot_be_written_is_said_before_the_work_and_stays(tmp_path):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "loop").symlink_to("loop")
+    for name in ("folder", "loop"):
+        with pytest.raises(OSError, match=name), files.writing(tmp_path / name):
+            pytest.fail("the work is done for nothing")
+    assert sorted(os.listdir(tmp_path)) == ["folder", "loop"] and (tmp_path / "loop").is_symlink()
+
+
+def test_a_reader_of_a_pipe_gets_the_whole_file(tmp_path):
+    pipe, got = tmp_path / "pipe", []
+    os.mkfifo(pipe)
+    reader = threading.Thread(target=lambda: got.append(pipe.read_bytes()), daemon=True)
+    reader.start()
+    files.write_text(pipe, "answer")
+    reader.join(10)
+    assert got == [b"answer"] and stat.S_ISFIFO(os.stat(pipe).st_mode) and os.listdir(tmp_path) == ["pipe"]
+
+
+def test_a_device_stays_one(tmp_path):
+    device = tmp_path / "null"
+    try:
+        os.mknod(device, 0o600 | stat.S_IFCHR, os.makedev(1, 3))
+        device.write_text("")
+    except OSError as error:
+        pytest.skip(f"no device may be made here: {error}")
+    files.write_text(device, "answer")
+    assert stat.S_ISCHR(os.stat(device).st_mode) and os.listdir(tmp_path) == ["null"]
+
+
+@pytest.mark.parametrize("printed_to", ["pipe", "file"])
+def test_what_is_printed_to_is_added_to(tmp_path, printed_to):
+    link = tmp_path / "stdout"
+    link.symlink_to("/dev/stdout")
+    code = (f"from mmgsd import files; print('before', flush=True); files.write_text({str(link)!r}, 'table\\n'); "
+            "print('after')")  # fmt: skip
+    with open(tmp_path / "log", "wb") as log:
+        out = log if printed_to == "file" else subprocess.PIPE
+        done = subprocess.run([sys.executable, "-c", code], stdout=out, stderr=subprocess.PIPE, check=True)
+    printed = (tmp_path / "log").read_bytes() if printed_to == "file" else done.stdout
+    assert printed.split() == [b"before", b"table", b"after"] and link.is_symlink()
+
+
+def test_a_mounted_file_is_written_where_it_is(tmp_path, monkeypatch):
+    def refuse(source, target):
+        raise OSError(errno.EBUSY, "Device or resource busy", str(source), None, str(target))
+
+    (tmp_path / "out.csv").write_text("a longer one, from before")
+    inode = (tmp_path / "out.csv").stat().st_ino
+    monkeypatch.setattr(os, "replace", refuse)
+    files.write_text(tmp_path / "out.csv", "answer")
+    assert (tmp_path / "out.csv").read_text() == "answer" and (tmp_path / "out.csv").stat().st_ino == inode
+    assert os.listdir(tmp_path) == ["out.csv"]
+
+
+@pytest.mark.parametrize("host", ["h", "node-" + "x" * 59])
+@pytest.mark.parametrize("name", ["b" * 251 + ".txt", "é" * 125 + ".txt", os.fsdecode(b"caf\xe9.txt"), "a[1].txt"])
+def test_every_legal_name_is_written_and_what_a_killed_process_left_of_it_is_found(tmp_path, monkeypatch, host, name):
+    monkeypatch.setattr(socket, "gethostname", lambda: host)
+    left = files.name_aside(tmp_path / name)
+    left = left.with_name(left.name.replace(f"-{os.getpid()}-", f"-{2**22 + 1}-"))  # no such process
+    left.touch()
+    assert len(os.fsencode(left.name)) <= 143
+    with files.locked(tmp_path / name, "writing"):
+        files.write_text(tmp_path / name, "whole")
+    assert os.listdir(tmp_path) == [name] and (tmp_path / name).read_text() == "whole"
+
+
+@pytest.mark.parametrize("number", [errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP])
+def test_without_file_locks_work_goes_on_and_is_said_once(tmp_path, monkeypatch, recwarn, number):
+    monkeypatch.setattr(files.fcntl, "flock", raising(number))
+    for _ in range(2):
+        with files.locked(tmp_path / "set", "rendering"):
+            pass
+    (warning,) = recwarn
+    assert "no file locks" in str(warning.message) and str(tmp_path) in str(warning.message)
+
+
+@pytest.mark.parametrize(("of", "number"), [("folder", errno.EINVAL), ("folder", errno.EIO), ("file", errno.ENOSYS)])
+def test_a_file_is_whole_where_the_disk_cannot_be_flushed(tmp_path, monkeypatch, recwarn, of, number):
+    def flush(handle):
+        if stat.S_ISDIR(os.fstat(handle).st_mode) == (of == "folder"):
+            raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(os, "fsync", flush)
+    for text in ("first", "second"):
+        assert files.write_text(tmp_path / "a.txt", text).read_text() == text
+    (warning,) = recwarn
+    assert "power cut" in str(warning.message) and str(tmp_path) in str(warning.message)
+
+
+@pytest.mark.parametrize("number", [errno.EIO, errno.ENOSPC])
+def test_a_file_that_did_not_reach_the_disk_is_not_put_in_place(tmp_path, monkeypatch, number):
+    files.write_text(tmp_path / "a.txt", "first")
+    monkeypatch.setattr(os, "fsync", raising(number))
+    with pytest.raises(OSError, match="while writing .*a.txt"):
+        files.write_text(tmp_path / "a.txt", "second")
+    assert (tmp_path / "a.txt").read_text() == "first"
 
 
 def test_a_full_disk_names_the_path(tmp_path):
@@ -77,6 +200,16 @@ def test_a_folder_takes_the_place_of_another(tmp_path):
     files.replace_folder(tmp_path / "new", tmp_path / "old", lambda path: True)
     assert (tmp_path / "old" / "a.png").read_text() == "new"
     assert os.listdir(tmp_path) == ["old"]
+
+
+def test_a_folder_is_replaced_though_the_old_one_cannot_go_at_once(tmp_path, monkeypatch):
+    files.write_text(tmp_path / "new" / "a.png", "new")
+    files.write_text(tmp_path / "old" / "a.png", "old")
+    monkeypatch.setattr(os, "rmdir", raising(errno.ENOTEMPTY))  # as NFS does while a file is open somewhere
+    monkeypatch.setattr(os, "unlink", raising(errno.EBUSY))
+    files.replace_folder(tmp_path / "new", tmp_path / "old", lambda path: True)
+    monkeypatch.undo()
+    assert (tmp_path / "old" / "a.png").read_text() == "new"
 
 
 def test_a_lock_names_the_process_that_holds_it_and_ends_with_it(tmp_path):

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import threading
+from itertools import product
 from pathlib import Path
 
 import cv2
@@ -10,7 +13,7 @@ import pytest
 import torch
 from PIL import Image
 
-from mmgsd.images import check_pixels, read_image, to_rgb
+from mmgsd.images import NO_PICTURES, check_mask, check_pixels, list_images, read_image, to_rgb
 
 FORMATS = ("png", "jpg", "webp", "tif", "gif", "bmp")
 
@@ -30,23 +33,84 @@ def write_image(path: Path, rng: np.random.Generator) -> Path:
     return path
 
 
-def test_photographs_are_read_upright(tmp_path: Path) -> None:
+TURNS = {1: (0, False), 2: (0, True), 3: (2, False), 4: (2, True), 5: (1, True), 6: (1, False), 7: (3, True),
+         8: (3, False)}  # fmt: skip  # what a camera notes: quarter turns to the left and a flip that were stored
+
+
+def write_photograph(path: Path, orientation: int, values: type = np.uint8) -> np.ndarray:
+    """A file that is stored turned, with the note of how; the picture (H, W, 3) uint8 that it shows."""
     shown = np.zeros((4, 6, 3), np.uint8)
-    shown[0] = 255
+    shown[0], shown[:, 0] = 255, 100
+    turns, flipped = TURNS[orientation]
+    stored = np.rot90(shown[:, ::-1] if flipped else shown, turns)
     exif = Image.Exif()
-    exif[0x0112] = 6  # stored turned: to be turned by 90° clockwise when shown
-    Image.fromarray(np.rot90(shown)).save(tmp_path / "photo.png", exif=exif)
-    np.testing.assert_array_equal(read_image(tmp_path / "photo.png"), shown)
+    exif[0x0112] = orientation
+    Image.fromarray(stored).save(path, exif=exif)
+    return shown
 
 
-@pytest.mark.parametrize("kind", ["png", "tif"])
-@pytest.mark.parametrize("channels", [1, 3, 4])
-def test_16_bits_are_scaled(tmp_path: Path, deep: np.ndarray, kind: str, channels: int) -> None:
+@pytest.mark.parametrize("orientation", TURNS)
+def test_a_photograph_is_upright_however_it_is_read(tmp_path: Path, orientation: int) -> None:
+    path = tmp_path / "photo.png"
+    shown = write_photograph(path, orientation)
+    with Image.open(path) as loaded, Image.open(path) as lazy:
+        loaded.load()
+        for image in (read_image(path), to_rgb(path), to_rgb(str(path)), to_rgb(lazy), to_rgb(loaded)):
+            np.testing.assert_array_equal(image, shown)
+        np.testing.assert_array_equal(check_mask(loaded.convert("1", dither=0), (4, 6), "mask0"), shown[..., 0] > 127)
+        np.testing.assert_array_equal(check_mask(path, (4, 6), "mask0"), shown[..., 0] > 127)
+
+
+def test_a_damaged_picture_names_the_argument(tmp_path: Path, rng: np.random.Generator) -> None:
+    path = write_image(tmp_path / "towel.png", rng)
+    path.write_bytes(path.read_bytes()[:500])
+    with Image.open(path) as image, pytest.raises(ValueError, match="^image7 "):
+        to_rgb(image, "image7")
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_a_pipe_is_read(tmp_path: Path, rng: np.random.Generator, kind: str) -> None:
+    path, pipe = write_image(tmp_path / f"towel.{kind}", rng), tmp_path / "pipe"
+    os.mkfifo(pipe)
+    for content in (path.read_bytes(), b""):
+        threading.Thread(target=pipe.write_bytes, args=(content,), daemon=True).start()
+        if content:
+            np.testing.assert_array_equal(read_image(pipe), read_image(path))
+    with pytest.raises(ValueError, match="pipe is empty"):
+        read_image(pipe)
+
+
+def test_of_a_folder_is_taken_what_can_be_read(tmp_path: Path) -> None:
+    readable = set()
+    for ending, kind in Image.registered_extensions().items():
+        for mode in ("RGB", "L", "1", "P", "I;16", "F"):
+            path = tmp_path / f"towel{ending.upper() if len(ending) % 2 else ending}"
+            try:
+                Image.new(mode, (32, 32)).save(path, kind)
+                read_image(path)
+            except (ValueError, OSError, KeyError):
+                path.unlink(missing_ok=True)
+                continue
+            readable |= set() if kind in NO_PICTURES else {path}
+            break
+    for other in ("notes.txt", ".hidden.png", "towel.h5", "towel.heic"):
+        (tmp_path / other).touch()
+    (tmp_path / "folder.png").mkdir()
+    assert {".jpg", ".jfif", ".ppm", ".avif", ".jp2", ".webp"} <= {path.suffix.lower() for path in readable}
+    assert {path.name for path in list_images(tmp_path)} == {path.name for path in readable} | {"towel.heic"}
+
+
+@pytest.mark.parametrize(
+    ("kind", "channels"), [*product(("png", "tif"), (1, 3, 4)), ("pgm", 1), ("ppm", 3)]
+)  # fmt: skip
+def test_16_bits_are_scaled_and_rounded(tmp_path: Path, deep: np.ndarray, kind: str, channels: int) -> None:
     path = tmp_path / f"deep.{kind}"
     cv2.imwrite(str(path), deep if channels == 1 else np.dstack([deep] * channels))
     image = read_image(path)
     assert (image.shape, image.dtype) == ((40, 60, 3), np.uint8)
-    np.testing.assert_allclose(image[..., 0], deep / 257, atol=1)
+    with Image.open(path) as opened:
+        for read in (image, to_rgb(opened)):
+            np.testing.assert_array_equal(read, np.dstack([np.rint(deep / 257)] * 3))
 
 
 @pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "RGBA", "CMYK", "YCbCr", "I;16", "F"])
@@ -143,7 +207,9 @@ def test_too_many_pixels_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         lambda image: image.astype(np.uint16) * 257, lambda image: image / 255, lambda image: np.float16(image / 255),
         lambda image: torch.from_numpy(image), lambda image: torch.from_numpy(image / 255).requires_grad_(),
         lambda image: torch.from_numpy(image / 255).bfloat16(), lambda image: image.tolist() and Image.fromarray(image),
-        lambda image: image > 100,
+        lambda image: image > 100, lambda image: (image * np.uint16(257)).astype(">u2"),
+        lambda image: (image / 255).astype(">f4"), lambda image: np.float32(image / 255) * np.float32(1 + 2e-7),
+        lambda image: image / 255 * 1.02 - 0.01,
     ],
 )  # fmt: skip
 def test_arrays_of_every_kind_show_the_same(convert: object) -> None:
@@ -162,14 +228,23 @@ def test_arrays_of_every_kind_show_the_same(convert: object) -> None:
         (np.zeros((4, 4), complex), "must be uint8 or float, got complex128"),
         (np.full((4, 4), -1), "got int64 from -1 to -1"),
         (np.full((4, 4), -0.5), r"must lie in \[0, 1\], got -0.5 to -0.5"),
+        (np.array([[0, 1.03]]), r"must lie in \[0, 1\], got 0.0 to 1.03: clip it"),
+        (np.array([[-1, 1.0]]), r"must lie in \[0, 1\], got -1.0 to 1.0: divide it"),
+        (np.array([[0, 1]], ">i4"), "got >i4 from 0 to 1"),
         ([[1, 2], [3]], "must be an array of numbers, got list"),
-        ("towel.png", "got the path 'towel.png': read it with mmgsd.read_image"),
         (None, r"got shape \(\)"),
     ],
 )
 def test_arrays_that_are_no_image_are_refused(bad: object, message: str) -> None:
     with pytest.raises(ValueError, match=f"^image7 .*{message}"):
         to_rgb(bad, "image7")
+
+
+@pytest.mark.parametrize("path", ["nowhere.png", Path("nowhere.png")])
+def test_a_path_that_leads_nowhere_is_named(path: object) -> None:
+    for read in (to_rgb, lambda path: check_mask(path, (4, 4), "mask0")):
+        with pytest.raises(FileNotFoundError, match="nowhere.png"):
+            read(path)
 
 
 @pytest.mark.parametrize("xy", [(3, 4), [3, 4], [(3, 4)], np.array([[3, 4]]), torch.tensor([3.0, 4.0])])

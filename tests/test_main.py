@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
+import os
+import sys
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -121,7 +125,7 @@ def test_the_picture_is_drawn(weights, images, capsys, tmp_path, pixels):
         ({"--weights": "towel"}, 2, "towel must be a safetensors file or one of 'cloth', "),
         ({"--out": "match.txt"}, 2, "argument --out: must end with .png"),
         ({"image1": "nowhere.png"}, 2, "nowhere.png does not exist"),
-        ({"image1": str(Path(__file__).parent)}, 2, "tests holds no image: its files must end with one of .png"),
+        ({"image1": str(Path(__file__).parent)}, 2, "tests holds no image: its files must end as images do"),
         ({"--pictures": "there"}, 2, "--pictures must be given with a folder as image1"),
         ({"--mask1": "nowhere.png"}, 2, "nowhere.png does not exist"),
         ({"--mask0": __file__}, 2, "is no image that can be read"),
@@ -156,6 +160,57 @@ def test_pixels_are_answered_together(images, masks, capsys, tmp_path):
     assert [[mode["answer"] for mode in query["modes"]] for query in queries] == [[1, 2, 3, 4]] * 2
     rows = (tmp_path / "answers.csv").read_text().splitlines()
     assert [row.split(",")[3] for row in rows[1:]] == ["1", "2", "3", "4"] * 2
+
+
+def test_a_pixel_may_lie_half_a_pixel_outside(weights, images, capsys):
+    asked = ["match", *images, "--weights", weights, "--xy"]
+    assert run(capsys, *asked, "-0.4,3").startswith("-0.4,3 -> ")
+    assert run(capsys, *asked, "3,-.4", "--xy", "-.25,-0.5", "--n", 1).count(" -> ") == 2
+    assert "must be two numbers" in fail(capsys, 2, *asked, "-0.4,b")
+
+
+def test_what_the_terminal_cannot_show_is_spelled(weights, images, monkeypatch):
+    printed = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(printed, "ascii"))
+    main(["match", *images, "--xy", "5,5", "--weights", str(weights)])
+    assert printed.getvalue().count(b"(+/-") == 4
+
+
+@pytest.fixture
+def piped_in():
+    """Puts bytes where the process reads from, until the test ends."""
+    kept = os.dup(0)
+
+    def fill(target: int, content: bytes) -> None:
+        with open(target, "wb") as file:
+            file.write(content)
+
+    def pipe(content: bytes) -> None:
+        source, target = os.pipe()
+        os.dup2(source, 0)
+        os.close(source)
+        threading.Thread(target=fill, args=(target, content)).start()
+
+    yield pipe
+    os.dup2(kept, 0)
+    os.close(kept)
+
+
+@pytest.mark.parametrize("name", ["-", "/dev/stdin", "/dev/fd/0"])
+@pytest.mark.parametrize("place", [1, 2])
+def test_an_image_may_be_piped_in(weights, images, capsys, piped_in, name, place):
+    asked = ["match", *images, "--xy", "5,5", "--weights", weights]
+    expected = run(capsys, *asked)
+    piped_in(Path(asked[place]).read_bytes())
+    asked[place] = name
+    assert run(capsys, *asked) == expected
+    assert "is empty" in fail(capsys, 2, *asked)
+
+
+def test_a_table_may_be_printed(weights, images, capfd):
+    out = run(capfd, "match", *images, "--xy", "5,5", "--weights", weights, "--csv", "/dev/stdout")
+    assert out.startswith("image1,x,y,mode") and out.splitlines()[-1].startswith("5,5 -> ")
+    assert Path("/dev/stdout").is_symlink()
 
 
 @pytest.mark.parametrize(
@@ -215,7 +270,24 @@ def test_a_folder_is_answered_for_but_for_what_is_damaged(weights, images, frame
     assert len(table) == 2 * 2 * 4 and table.image1.unique().tolist() == ["a.png", "c.png"]
     expected = [mode["xy"][0] for query in alone for mode in query["modes"]]
     assert table[table.image1 == "c.png"].x1.tolist() == expected
-    assert sorted(path.name for path in (tmp_path / "drawn").iterdir()) == ["a.png.png", "c.png.png"]
+    assert sorted(path.name for path in (tmp_path / "drawn").iterdir()) == ["a.png", "c.png"]
+
+
+def test_of_a_folder_all_is_answered_that_can_be_read_and_the_rest_is_said(weights, images, frames, capsys, tmp_path):
+    (frames / "b.png").unlink()
+    others = ["c.jfif", "c.ppm", "c.avif", "c.jp2", os.fsdecode(b"caf\xe9.webp"), "x" * 170 + ".webp"]
+    (frames / "empty").mkdir()
+    for name in others:
+        Image.open(images[1]).convert("RGB").save(frames / name)
+    asked = ["match", images[0], frames, "--xy", "5,5", "--weights", weights]
+    main([str(a) for a in [*asked, "--csv", tmp_path / "all.csv", "--pictures", tmp_path / "drawn"]])
+    printed = capsys.readouterr()
+    expected = sorted(["a.png", "c.png", *others])
+    spelled = [name.encode("utf-8", "backslashreplace").decode() for name in expected]
+    assert [line.split()[0] for line in printed.out.splitlines()] == spelled
+    assert "left out" in printed.err and "empty, notes.txt" in printed.err
+    assert pd.read_csv(tmp_path / "all.csv").image1.unique().tolist() == spelled
+    assert sorted(os.listdir(tmp_path / "drawn")) == [f"{name}.png" for name in expected]  # several are called c
 
 
 def test_one_image_may_have_a_table_too(seeing, images, capsys, tmp_path):

@@ -18,7 +18,7 @@ import numpy as np
 
 from mmgsd.checks import check
 from mmgsd.files import DamagedFileError, read_json, write_bytes, write_json
-from mmgsd.images import check_pixels, encode_image, read_image
+from mmgsd.images import check_pixels, encode_image, find_beside, read_image
 
 LOOK = {"image", "moves", "anchors"}
 LEAST = 2  # pixels that tell a motion
@@ -69,7 +69,7 @@ def _read_look(path: Path, number: int, look: Any) -> Look:
     if not isinstance(look, dict) or not {"image", "moves"} <= set(look) <= LOOK or not isinstance(look["image"], str):
         accepted = "'image', a file's name, 'moves' and maybe 'anchors'"
         raise DamagedFileError(f"{where} must hold {accepted}, got {look!r:.80}")
-    image = read_image(path.parent / look["image"])
+    image = read_image(find_beside(path, look["image"]))
     moves, anchors = (_read_pixels(where, key, look.get(key, []), shape) for key, shape in
                       (("moves", (2, 2)), ("anchors", (2,))))  # fmt: skip
     if not len(moves):

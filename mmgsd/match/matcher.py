@@ -191,7 +191,7 @@ class Matcher:
     ) -> Match:  # fmt: skip
         """All matches in ``image1`` of the pixels ``xy`` (S, 2), or of the one pixel (2,), of ``image0``.
 
-        Images are of any size and each of its own, and of any kind that `mmgsd.images.to_rgb` takes; they are copied.
+        Images are of any size and each of its own, paths or of any kind that `mmgsd.images.to_rgb` takes, and copied.
         ``n`` modes are returned, one number for all or (S,), by default as many as the symmetry group has members;
         "auto" finds their number. The group's number is fitted even where fewer are asked for: of these the most
         probable are the answer, and their weights are divided by their sum. ``mask0`` and ``mask1``, (H, W) bool each,

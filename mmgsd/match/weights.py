@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -71,11 +72,15 @@ def _check_file(path: Path) -> None:
         raise ValueError(f"{path} is a folder: give the path of a safetensors file in it")
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist: train a model, or give the path of its weights")
+    if not path.is_file():  # a pipe would be read up in being looked at
+        raise ValueError(f"{path} is no regular file: give the path of a safetensors file")
     open(path, "rb").close()  # PermissionError names the file
 
 
 def _describe_damage(path: Path, error: Exception) -> str:
     """Why it is no safetensors file; asked only once it is known to be none, for one may begin with the same bytes."""
+    if str(path).encode(errors="replace") != os.fsencode(path):
+        return f"{path} must have a name in UTF-8, its folders' names, too: rename it"
     with open(path, "rb") as file:
         start = file.read(4)
     if start.startswith(PICKLES):

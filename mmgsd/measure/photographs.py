@@ -36,7 +36,7 @@ from tqdm.auto import tqdm
 
 from mmgsd.dataset import load_dataset
 from mmgsd.files import DamagedFileError, read_json, write_json, write_text
-from mmgsd.images import check_pixels, read_image
+from mmgsd.images import check_pixels, find_beside, read_image
 from mmgsd.match.match import Match
 from mmgsd.match.matcher import Matcher, find_weights
 from mmgsd.paths import find_root
@@ -106,7 +106,7 @@ def _read_entry(path: Path, number: int, entry: dict[str, Any]) -> Photograph | 
         size_px = float(np.linalg.norm(xy - np.roll(xy, 1, 0), axis=1).mean())
     share = STICKERED_SHARE if entry.get("visible_corner_stickers") else SIZE_SHARE
     askable = whole or by in ("ends", "marks")
-    return Photograph(path.parent / name, str(entry.get("repo") or "own"), xy, size_px, share, askable)
+    return Photograph(find_beside(path, name), str(entry.get("repo") or "own"), xy, size_px, share, askable)
 
 
 def _list_seen(places: Any, where: str, key: str) -> list[list[float]]:

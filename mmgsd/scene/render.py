@@ -11,7 +11,9 @@ The scene's conventions, for the modules that build objects (``cloth.py``, ``rop
 
 from __future__ import annotations
 
+import errno
 import os
+import shutil
 import struct
 import tempfile
 from collections.abc import Callable
@@ -26,6 +28,8 @@ from mathutils.bvhtree import BVHTree
 from mmgsd.files import scratch_folder
 
 MASK_PASS = "object"  # the shader output that is 1 on the object and 0 elsewhere
+MEMORY = Path("/dev/shm")  # files in memory, where the system has it
+VIEW_BYTES = 10  # of a pixel in a rendered file, at least: red, green, blue, opacity and mask, 16 bits each
 GPU_BACKENDS = ("OPTIX", "CUDA", "HIP", "METAL")
 
 OwnHit = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -153,12 +157,18 @@ def place_camera(scene: bpy.types.Scene, camera: Camera) -> None:
 
 
 def render_image(scene: bpy.types.Scene, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Render the scene: image (H, W, 3) uint8 sRGB, and mask (H, W) bool of pixels at least half object."""
+    """Render the scene: image (H, W, 3) uint8 sRGB, and mask (H, W) bool of pixels at least half object.
+
+    OSError, which names the folders, where there is no room for a temporary file.
+    """
     scene.cycles.seed = seed
-    with scratch_folder(_memory_folder(), "mmgsd-view") as folder:
+    size = VIEW_BYTES * scene.render.resolution_x * scene.render.resolution_y
+    with scratch_folder(_find_room(size), "mmgsd-view") as folder:
         path = folder / "view.exr"
-        scene.render.filepath = str(path)
+        scene.render.filepath = str(path).replace("{", "{{").replace("}", "}}")  # Blender fills in single braces
         bpy.ops.render.render(write_still=True)
+        if path.stat().st_size < size:  # Blender says nothing of a full disk
+            raise OSError(errno.ENOSPC, f"{folder.parent} became full: set TMPDIR to a folder with room")
         channels = read_exr(path)
     layer = scene.view_layers[0].name
     linear = np.stack([channels[f"{layer}.Combined.{c}"] for c in "RGB"], axis=-1)
@@ -166,9 +176,16 @@ def render_image(scene: bpy.types.Scene, seed: int) -> tuple[np.ndarray, np.ndar
     return encode_srgb(linear), mask
 
 
-def _memory_folder() -> Path:
-    """A folder in memory where the system has one: these files live for milliseconds."""
-    return Path("/dev/shm" if os.access("/dev/shm", os.W_OK) else tempfile.gettempdir())
+def _find_room(size: int) -> Path:
+    """A folder for a file of a ``size`` in bytes that lives for milliseconds: in memory where it has room for many."""
+    disk = Path(tempfile.gettempdir())
+    others = 2 * (os.cpu_count() or 1)  # a child a core renders, and the file is larger than its pixels
+    if os.access(MEMORY, os.W_OK) and shutil.disk_usage(MEMORY).free > others * size:
+        return MEMORY
+    if shutil.disk_usage(disk).free < 2 * size:
+        raise OSError(errno.ENOSPC, f"{disk} and {MEMORY} have no room for a view's {2 * size / 1e6:.1f} MB: "
+                      "set TMPDIR to a folder with room")  # fmt: skip
+    return disk
 
 
 def encode_srgb(linear: np.ndarray) -> np.ndarray:

@@ -51,6 +51,13 @@ def test_what_is_wrong_with_a_demonstration_is_named(written: Path, case: str) -
     assert "edge.json" in str(error.value)
 
 
+def test_folders_are_divided_as_anywhere(written: Path) -> None:
+    (written.parent / "looks").mkdir()
+    written.with_name("edge_0.webp").rename(written.parent / "looks" / "edge_0.webp")
+    written.write_text(written.read_text().replace("edge_0.webp", r"looks\\edge_0.webp"))
+    assert read_demonstration(written).looks[0].image.shape == (40, 60, 3)
+
+
 def test_a_missing_image_is_named(written: Path) -> None:
     written.with_name("edge_1.webp").unlink()
     with pytest.raises(FileNotFoundError, match="edge_1.webp"):

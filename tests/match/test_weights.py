@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -142,6 +143,18 @@ def test_a_pickle_is_no_safetensors(matcher: Matcher, tmp_path: Path) -> None:
 def test_a_folder_is_no_file(tmp_path: Path, read: object) -> None:
     with pytest.raises(ValueError, match=f"{tmp_path.name} is a folder: give the path of a safetensors file in it"):
         read(tmp_path)
+
+
+def test_a_name_that_cannot_be_read_is_not_called_damage(matcher: Matcher, tmp_path: Path) -> None:
+    path = save_weights(tmp_path / "w.safetensors", matcher.network)
+    with pytest.raises(ValueError, match="must have a name in UTF-8"):
+        load(path.rename(tmp_path / os.fsdecode(b"caf\xe9.safetensors")))
+
+
+def test_a_pipe_is_no_file_of_weights(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")  # to be opened, it would wait for who writes into it
+    with pytest.raises(ValueError, match="pipe is no regular file"):
+        load(tmp_path / "pipe")
 
 
 def test_a_file_that_may_not_be_read(matcher: Matcher, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -78,8 +78,17 @@ def write_index(folder: Path, entries: Any) -> None:
 
 def read_one(folder: Path, kind: str = "cloth", **entry: Any) -> photographs.Photograph:
     """What is read of one entry, beside another that can be asked about."""
-    write_index(folder, [{"file": "0.png", "kind": kind, **entry}, {"file": "1.png", "marks": [[1, 2]]}])
+    write_index(folder, [{"file": "0.png", "kind": kind} | entry, {"file": "1.png", "marks": [[1, 2]]}])
     return read_photographs(folder, kind)[0]
+
+
+def test_folders_are_divided_as_anywhere(folder: Path) -> None:
+    (folder / "imgs" / "new").mkdir(parents=True)
+    (folder / "0.png").rename(folder / "imgs" / "new" / "a.png")
+    for name in ("imgs/new/a.png", "imgs\\new\\a.png", ".\\imgs/new\\a.png"):
+        assert read_one(folder, file=name, corners=SQUARE.tolist()).read().shape == (*SIZE[::-1], 3)
+    (folder / "b\\c.png").write_bytes((folder / "1.png").read_bytes())  # a legal name where / divides
+    assert read_one(folder, file="b\\c.png", corners=SQUARE.tolist()).read().shape == (*SIZE[::-1], 3)
 
 
 def test_what_is_found_by_hand(folder: Path) -> None:

@@ -2,9 +2,13 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
+import tempfile
 import zipfile
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -72,6 +76,58 @@ def test_visible_points_lie_in_the_mask(folded):
     x, y = np.rint(camera.project(deformed.points[visible])).astype(int).T
     assert np.mean(distance_transform_edt(~mask)[y, x] <= 1.5) > 0.99
     assert 0.5 < visible.mean() < 1.0  # the corner hides a part of the cloth
+
+
+@pytest.fixture
+def temporary(tmp_path, monkeypatch):
+    """A folder for temporary files whose name means something to Blender."""
+    folder = tmp_path / "a{x}b#{{c"
+    folder.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(folder))
+    return folder
+
+
+def test_a_view_is_rendered_below_any_folder(temporary, monkeypatch):
+    monkeypatch.setattr(render, "MEMORY", temporary / "nowhere")
+    scene = render.reset_scene()
+    render.setup_cycles(scene, (16, 12), 1)
+    render.place_camera(scene, render.Camera(np.diag([16.0, 16.0, 1.0]), np.eye(4), (16, 12)))
+    assert render.render_image(scene, seed=0)[0].shape == (12, 16, 3)
+    assert os.listdir(temporary) == [] and os.listdir(temporary.parent) == [temporary.name]
+
+
+@pytest.mark.parametrize(
+    ("writable", "memory_mb", "disk_mb", "expected"),
+    [(True, 64, 10, "memory"), (True, 1, 10, "disk"), (False, 64, 10, "disk"), (True, 1, 1, ""), (False, 64, 1, "")],
+)
+def test_a_view_goes_where_there_is_room(temporary, tmp_path, monkeypatch, writable, memory_mb, disk_mb, expected):
+    memory = tmp_path / "memory"
+    memory.mkdir()
+    free = {memory: memory_mb, temporary: disk_mb}
+    monkeypatch.setattr(render, "MEMORY", memory)
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    monkeypatch.setattr(os, "access", lambda *_: writable)
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=1e6 * free[folder]))
+    if expected:
+        assert render._find_room(3_000_000) == {"memory": memory, "disk": temporary}[expected]
+        return
+    with pytest.raises(OSError, match="TMPDIR") as caught:
+        render._find_room(3_000_000)
+    assert str(temporary) in str(caught.value) and str(memory) in str(caught.value)
+
+
+def test_a_folder_that_became_full_is_named(temporary, monkeypatch):
+    monkeypatch.setattr(render, "MEMORY", temporary / "nowhere")
+    scene = SimpleNamespace(cycles=SimpleNamespace(), render=SimpleNamespace(resolution_x=16, resolution_y=12))
+
+    def write_part(**_):
+        Path(scene.render.filepath.replace("{{", "{").replace("}}", "}")).write_bytes(bytes(100))
+
+    operators = SimpleNamespace(render=SimpleNamespace(render=write_part))
+    monkeypatch.setattr(render, "bpy", SimpleNamespace(ops=operators))
+    with pytest.raises(OSError, match="became full.*TMPDIR") as caught:
+        render.render_image(scene, seed=0)
+    assert str(temporary) in str(caught.value)
 
 
 def test_flat_cloth_is_all_visible_and_its_corners_are_the_masks_corners():
