@@ -19,7 +19,7 @@ DEEP = 257  # steps of 16 bits to a step of 8: 65535 becomes 255
 
 
 def read_image(path: Path | str) -> np.ndarray:
-    """(H, W, 3) uint8 of an image file, upright as its camera noted.
+    """(H, W, 3) uint8 RGB of an image file, upright as its camera noted.
 
     16 bits and floats in [0, 1] are scaled to 8 bits; of a file with several pictures the first is read; transparency
     is left out: what counts are the colours beneath it. FileNotFoundError, PermissionError, or ValueError for a file
@@ -97,7 +97,7 @@ def _convert(image: Image.Image, name: str) -> np.ndarray:
 
 
 def to_rgb(image: Any, name: str = "image") -> np.ndarray:
-    """A copy (H, W, 3) uint8 of a grey, RGB or RGBA array, tensor or Pillow image; ValueError names the argument.
+    """A copy (H, W, 3) uint8 RGB of a grey, RGB or RGBA array, tensor or Pillow image; ValueError names the argument.
 
     (H, W), (H, W, 1), (H, W, 3) or (H, W, 4) of uint8, uint16 (scaled), bool (black and white) or float in [0, 1].
     Transparency is left out: what counts are the colours beneath it.
