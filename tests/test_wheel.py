@@ -121,7 +121,8 @@ def read_block(start: str) -> str:
 
 
 def test_the_readmes_first_lines_run_in_an_empty_folder(installed: Path, tmp_path: Path) -> None:
-    done = run_installed(installed, tmp_path, read_block("import mmgsd") + "\nprint(match.modes.shape, both.modes.shape)")
+    code = read_block("import mmgsd") + "\nprint(match.modes.shape, both.modes.shape)"
+    done = run_installed(installed, tmp_path, code)
     assert (done.returncode, done.stdout) == (0, "(1, 4, 2) (2, 4, 2)\n"), done.stderr
 
 

@@ -156,7 +156,7 @@ def _time_question(matcher: Matcher, root: Path) -> dict[str, Any]:
 
 
 def measure_side(folder: Path) -> float:
-    """px of a flat cloth's side, or a straight rope's length: the median over a data set's images of these states."""
+    """px of a flat cloth's side, or a straight rope's length: the median over a data set's images of these."""
     lengths = []
     for data in (load_dataset(folder, split) for split in SPLITS):
         along = data.xy[data.labels.state.isin(PLAIN).to_numpy(), : SIDE_POINTS[data.object]]
