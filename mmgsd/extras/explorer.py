@@ -23,7 +23,6 @@ import anywidget
 import cv2
 import numpy as np
 import traitlets
-from matplotlib import pyplot as plt
 
 from mmgsd.experiments import get_label
 from mmgsd.extras.explorer_scenes import Scene
@@ -97,7 +96,6 @@ class Explorer:
         images, written = [self.scene.image0, self.scene.image1], io.BytesIO()
         figure = plot_samples(images, columns=2) if self.answer is None else self.answer.plot(len(self.answer) - 1)
         figure.savefig(written, format="jpeg", bbox_inches="tight")
-        plt.close(figure)
         return written.getvalue()
 
     def open(self, index: int) -> None:
