@@ -1,4 +1,4 @@
-"""The command line, ``python -m mmgsd COMMAND``: its words. What the commands do is in `mmgsd.cli`."""
+"""The words of the command line ``mmgsd``, or ``python -m mmgsd``. What its commands do is in `mmgsd.cli`."""
 
 from __future__ import annotations
 
@@ -8,12 +8,15 @@ import re
 import sys
 from pathlib import Path
 
+import numpy as np
+
 import mmgsd
 from mmgsd import cli
 from mmgsd.command import describe_error, print_anywhere
-from mmgsd.config import MAX_MODES
+from mmgsd.config import MAX_MODES, OBJECTS
+from mmgsd.match.camera import read_intrinsics
 
-EXAMPLE = "example: python -m mmgsd match towel1.jpg towel2.jpg --xy 212,148 --weights FILE --out match.png"
+EXAMPLE = "example: %(prog)s towel1.jpg towel2.jpg --xy 212,148 --weights FILE --out match.png"
 PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
 
 
@@ -60,7 +63,8 @@ def _say_kept(args: argparse.Namespace) -> str:
 
 def make_parser() -> argparse.ArgumentParser:
     """The commands and their options."""
-    parser = argparse.ArgumentParser(prog="python -m mmgsd", description=mmgsd.__doc__)
+    prog = "python -m mmgsd" if Path(sys.argv[0]).name == "__main__.py" else "mmgsd"
+    parser = argparse.ArgumentParser(prog=prog, description=mmgsd.__doc__.partition("\n")[0])
     commands = parser.add_subparsers(dest="command", required=True, metavar="command")
     _add_match(commands.add_parser("match", help="find all matches of pixels of an image in others", epilog=EXAMPLE))
     _add_segment(commands.add_parser("segment", help="write where an image shows the object"))
@@ -72,6 +76,9 @@ def make_parser() -> argparse.ArgumentParser:
         command.add_argument("--weights", metavar="FILE", **default,
                              help="a trained model (safetensors), or a name in data/weights, like cloth")  # fmt: skip
     _add_measures(commands)
+    samples = commands.add_parser("samples", help="print the paths of two sample images")
+    samples.add_argument("object", nargs="?", default="cloth", choices=OBJECTS)
+    samples.set_defaults(run=cli.samples)
     return parser
 
 
@@ -117,7 +124,8 @@ def _add_fold(fold: argparse.ArgumentParser) -> None:
     fold.add_argument("--chosen", default="agree", choices=("agree", "best", "joint"),
                       help="which like modes are taken: those that one motion agrees with (the default), each pixel's "
                       "surest, or the surest that belong together")  # fmt: skip
-    fold.add_argument("--intrinsics", type=_parse_intrinsics, metavar="FX,FY,CX,CY", help="px; prints rays too")
+    fold.add_argument("--intrinsics", type=_parse_intrinsics, metavar="FX,FY,CX,CY",
+                      help="px, or the nine numbers of the matrix; prints rays too")  # fmt: skip
     fold.add_argument("--out", type=_parse_picture, metavar="FILE", help="draw the moves (png, jpg, pdf or svg)")
     fold.add_argument("--json", action="store_true", help="print the answer as JSON")
     fold.set_defaults(run=cli.fold)
@@ -125,7 +133,8 @@ def _add_fold(fold: argparse.ArgumentParser) -> None:
 
 def _add_segment(segment: argparse.ArgumentParser) -> None:
     segment.add_argument("image", type=_parse_image, help="the image to look at")
-    segment.add_argument("out", type=Path, help="the mask to write, .png: brighter than half on the object")
+    segment.add_argument("--out", type=Path, required=True, metavar="FILE",
+                         help="the mask to write, .png: brighter than half on the object")  # fmt: skip
     segment.set_defaults(run=cli.segment)
 
 
@@ -139,7 +148,7 @@ def _add_measure(measure: argparse.ArgumentParser) -> None:
 
 
 def _add_export(export: argparse.ArgumentParser) -> None:
-    export.add_argument("out", type=Path, help="the file to write, .onnx")
+    export.add_argument("--out", type=Path, required=True, metavar="FILE", help="the file to write, .onnx")
     export.set_defaults(run=cli.export)
 
 
@@ -163,16 +172,11 @@ def _parse_picture(text: str) -> Path:
     return Path(text)
 
 
-def _parse_intrinsics(text: str) -> tuple[float, ...]:
+def _parse_intrinsics(text: str) -> np.ndarray:
     try:
-        numbers = tuple(map(float, text.split(",")))
-    except ValueError:
-        numbers = ()
-    if len(numbers) != 4 or not min(numbers[:2]) > 0:
-        raise argparse.ArgumentTypeError(
-            f"must be FX,FY,CX,CY, four numbers in px, the first two above 0, got {text!r}"
-        )
-    return numbers
+        return read_intrinsics([float(number) for number in text.split(",")])
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"must be FX,FY,CX,CY, or nine numbers: {error}") from error
 
 
 def _parse_number(text: str) -> int | str:

@@ -174,9 +174,9 @@ def save_picture(figure: Any, path: Path) -> None:
 def segment(args: argparse.Namespace) -> None:
     """Write the probability of the object in each pixel as a grey PNG, white where it is certain."""
     if args.out.suffix.lower() != ".png":
-        raise ValueError(f"out must end with .png, got {args.out}")
+        raise ValueError(f"--out must end with .png, got {args.out}")
     if args.out.resolve() == args.image.resolve():
-        raise ValueError(f"out must not be the image itself, got {args.out}")
+        raise ValueError(f"--out must not be the image itself, got {args.out}")
     mask = mmgsd.load(args.weights).segment(mmgsd.read_image(args.image))
     grey = np.rint(255 * mask).astype(np.uint8)
     write_bytes(args.out, cv2.imencode(".png", grey)[1].tobytes())
@@ -200,6 +200,11 @@ def measure(args: argparse.Namespace) -> None:
     if args.store:
         store_photographs(results, args.store)
     print(json.dumps(results) if args.json else make_photographs_table(results), flush=True)
+
+
+def samples(args: argparse.Namespace) -> None:
+    """Print the paths of the sample images of an object, a line each."""
+    print(*mmgsd.find_samples(args.object), sep="\n")
 
 
 def export(args: argparse.Namespace) -> None:
@@ -245,9 +250,8 @@ def fold(args: argparse.Namespace) -> None:
     if args.out:
         draw_moves(demonstration.looks[args.look], image, answer.moves, args.out)
     moves = [{"pick": pick, "place": place} for pick, place in answer.moves.round(1).tolist()]
-    if args.intrinsics:
-        fx, fy, cx, cy = args.intrinsics
-        rays = compute_rays(answer.moves, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])).round(5).tolist()
+    if args.intrinsics is not None:
+        rays = compute_rays(answer.moves, args.intrinsics).round(5).tolist()
         moves = [
             {**move, "pick_ray": pick, "place_ray": place} for move, (pick, place) in zip(moves, rays, strict=True)
         ]
@@ -256,6 +260,6 @@ def fold(args: argparse.Namespace) -> None:
         return
     for move in moves:
         told = {name: ",".join(f"{number:g}" for number in numbers) for name, numbers in move.items()}
-        rays = f" (rays {told['pick_ray']} and {told['place_ray']})" if args.intrinsics else ""
+        rays = f" (rays {told['pick_ray']} and {told['place_ray']})" if "pick_ray" in told else ""
         print(f"pick {told['pick']} place {told['place']}{rays}")
     print(f"{answer.share:.0%} of the demonstration's pixels agree", flush=True)

@@ -25,7 +25,7 @@ OVERSHOOT = 0.01  # beyond [0, 1] that an antialiased or bicubic resize leaves, 
 
 
 def read_image(path: Path | str) -> np.ndarray:
-    """(H, W, 3) uint8 of an image file, upright as its camera noted.
+    """(H, W, 3) uint8 RGB of an image file, upright as its camera noted.
 
     16 bits and floats in [0, 1] are scaled to 8 bits and rounded; of a file with several pictures the first is read;
     transparency is left out: what counts are the colours beneath it; a pipe is read to its end. FileNotFoundError,
@@ -143,7 +143,7 @@ def _round_colours(image: Image.Image) -> Image.Image:
 
 
 def to_rgb(image: Any, name: str = "image") -> np.ndarray:
-    """A copy (H, W, 3) uint8 of a grey, RGB or RGBA array, tensor or Pillow image, or of a file by its path.
+    """A copy (H, W, 3) uint8 RGB of a grey, RGB or RGBA array, tensor or Pillow image, or of a file by its path.
 
     (H, W), (H, W, 1), (H, W, 3) or (H, W, 4) of uint8, uint16 (scaled), bool (black and white) or float in [0, 1].
     Transparency is left out: what counts are the colours beneath it. Pillow images are turned upright, as `read_image`

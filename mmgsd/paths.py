@@ -6,7 +6,11 @@ import dataclasses
 import os
 from pathlib import Path
 
-from mmgsd.config import TrainConfig
+from mmgsd.checks import check_choice
+from mmgsd.config import OBJECTS, TrainConfig
+
+SAMPLES = {"cloth": ("test_000007_00.webp", "test_000002_00.webp"),
+           "rope": ("test_000007_00.webp", "test_000006_00.webp")}  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,9 +50,20 @@ class Paths:
 
 def find_shipped() -> Path:
     """The folder of the shipped weights: within the package where it is installed, ``data/weights`` in a checkout."""
+    return _find_folder("weights", "weights")
+
+
+def find_samples(object: str = "cloth") -> tuple[Path, Path]:
+    """Two image files of a ``cloth`` or a ``rope`` that no weights learnt from; ValueError for another object."""
+    check_choice("object", object, OBJECTS)
+    folder = _find_folder(f"samples/{object}", f"sample/{object}/images")
+    return tuple(folder / name for name in SAMPLES[object])
+
+
+def _find_folder(installed: str, checkout: str) -> Path:
+    """A folder within the package where it is installed, or below ``data`` in a checkout."""
     package = Path(__file__).resolve().parent
-    installed = package / "weights"
-    return installed if installed.is_dir() else package.parent / "data" / "weights"
+    return package / installed if (package / installed).is_dir() else package.parent / "data" / checkout
 
 
 def find_root(start: Path | None = None) -> Path:

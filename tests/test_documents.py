@@ -8,9 +8,11 @@ import subprocess
 from pathlib import Path
 
 import nbformat
+import numpy as np
 import pandas as pd
 import pytest
 
+from mmgsd.dataset import load_dataset
 from mmgsd.report.findings import FINDINGS, SECTIONS
 from mmgsd.report.tables import update_tables
 
@@ -115,3 +117,23 @@ def test_lessons_are_of_commits_and_of_rows_of_their_date() -> None:
         told = subprocess.run(["git", "log", "-1", "--format=%ad", "--date=short", commit], cwd=ROOT,
                               capture_output=True, text=True, check=True).stdout.strip()  # fmt: skip
         assert (date, commit) in ran or told == date, f"{commit} of {date}"
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "notebooks").glob("*.ipynb")), ids=lambda path: path.stem)
+def test_what_notebooks_show_is_shown_as_what_it_is(path: Path) -> None:
+    outputs = [output for cell in nbformat.read(path, 4).cells for output in cell.get("outputs", [])]
+    for output in outputs:
+        data = output.get("data", {})
+        assert "|---" not in output.get("text", ""), "Markdown as text"
+        assert "Empty DataFrame" not in data.get("text/plain", ""), "an empty table"
+        if "the explorer" in data.get("text/plain", ""):
+            assert "image/jpeg" in data, "a page that runs nothing shows nothing"
+
+
+def test_an_image_without_the_object_has_no_overlap_with_it() -> None:
+    cells = nbformat.read(ROOT / "notebooks" / "12_other_pictures.ipynb", 4).cells
+    (shown,) = (output.data["text/plain"] for cell in cells for output in cell.get("outputs", [])
+                if "mask IoU" in output.get("data", {}).get("text/plain", ""))  # fmt: skip
+    overlap = [float(line.split()[1]) for line in shown.splitlines()[1:]]
+    present = load_dataset(ROOT / "data" / "sample" / "workspace" / "cloth", "test").present
+    assert np.isfinite(overlap).tolist() == present.tolist()

@@ -6,6 +6,7 @@ import dataclasses
 import io
 import json
 import os
+import re
 import sys
 import threading
 from pathlib import Path
@@ -23,6 +24,7 @@ from mmgsd.dataset import load_dataset
 from mmgsd.images import read_mask
 from mmgsd.learn.training import train_model
 from mmgsd.match.matcher import Matcher, Pair, load
+from mmgsd.paths import find_samples
 
 CONFIG = TrainConfig(steps=1, batch=2, pairs=2, queries=4, input_px=64, descriptor_dim=4)
 SIZES = [(300, 200), (120, 160)]  # of the images
@@ -244,14 +246,15 @@ def test_a_segmented_image_is_a_mask(seeing, images, capsys, tmp_path, monkeypat
     shown[:, :100] = 0.51
     monkeypatch.setattr(Matcher, "segment", lambda *_: shown)
     out = tmp_path / "new" / "mask.png"
-    assert "33% of the image" in run(capsys, "segment", images[0], out, "--weights", seeing)
+    assert "33% of the image" in run(capsys, "segment", images[0], "--out", out, "--weights", seeing)
     np.testing.assert_array_equal(read_mask(out, shown.shape), shown > 0.5)
 
 
 def test_what_cannot_be_segmented_is_said(weights, images, capsys, tmp_path):
-    assert "learnt no mask" in fail(capsys, 2, "segment", images[0], tmp_path / "m.png", "--weights", weights)
-    assert "out must end with .png" in fail(capsys, 2, "segment", images[0], "m.jpg", "--weights", weights)
-    assert "must not be the image itself" in fail(capsys, 2, "segment", images[0], images[0], "--weights", weights)
+    asked = ["segment", images[0], "--weights", weights, "--out"]
+    assert "learnt no mask" in fail(capsys, 2, *asked, tmp_path / "m.png")
+    assert "--out must end with .png" in fail(capsys, 2, *asked, "m.jpg")
+    assert "--out must not be the image itself" in fail(capsys, 2, *asked, images[0])
 
 
 def test_a_folder_is_answered_for_but_for_what_is_damaged(weights, images, frames, capsys, tmp_path):
@@ -391,9 +394,24 @@ def test_a_full_disk_is_named(weights, images, capsys, tmp_path, monkeypatch, wh
     out = tmp_path / "new" / ("m.png" if what == "picture" else "m.onnx")
     monkeypatch.setattr("matplotlib.figure.Figure.savefig", raising(OSError(28, "No space left on device")))
     monkeypatch.setattr("onnx.save", raising(OSError(28, "No space left on device")))
-    asked = ["match", *images, "--xy", "5,5", "--out", out] if what == "picture" else ["export", out]
+    asked = ["match", *images, "--xy", "5,5", "--out", out] if what == "picture" else ["export", "--out", out]
     assert f"No space left on device while writing {out}" in fail(capsys, 1, *asked, "--weights", weights)
     assert list(out.parent.iterdir()) == []
+
+
+@pytest.mark.parametrize("start", [("/usr/bin/mmgsd", "mmgsd"), ("/there/mmgsd/__main__.py", "python -m mmgsd")])
+def test_help_names_the_command_as_it_was_called_and_one_form_of_out(capsys, monkeypatch, start):
+    monkeypatch.setattr("sys.argv", [start[0]])
+    for command in ("match", "segment", "measure", "fold", "export", "heads"):
+        with pytest.raises(SystemExit):
+            main([command, "--help"])
+        told = capsys.readouterr().out
+        assert told.startswith(f"usage: {start[1]} {command} ") and re.search(r"--out FILE\b", told)
+
+
+@pytest.mark.parametrize("object", ["cloth", "rope"])
+def test_the_paths_of_the_sample_images_are_printed(capsys, object):
+    assert run(capsys, "samples", object).splitlines() == [str(path) for path in find_samples(object)]
 
 
 def test_a_command_is_asked_for(capsys):
@@ -403,7 +421,7 @@ def test_a_command_is_asked_for(capsys):
 def test_onnx_gives_the_same_descriptors_for_any_size(weights, capsys, tmp_path):
     path, neighbour = tmp_path / "cloth.onnx", tmp_path / "cloth.tmp"
     neighbour.write_text("a user's own")
-    assert "differ from torch's by" in run(capsys, "export", path, "--weights", weights)
+    assert "differ from torch's by" in run(capsys, "export", "--out", path, "--weights", weights)
     session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
     metadata = session.get_modelmeta().custom_metadata_map
     assert (metadata["input_size"], metadata["quarter_turns"], metadata["multiple_of"]) == ("64 64", "4", "8")
@@ -421,13 +439,13 @@ def test_onnx_gives_the_same_descriptors_for_any_size(weights, capsys, tmp_path)
 
 def test_nothing_is_left_of_an_export_that_differs(weights, capsys, tmp_path, monkeypatch):
     monkeypatch.setattr("mmgsd.extras.exporting._compare", lambda *_: 1.0)
-    said = fail(capsys, 1, "export", tmp_path / "cloth.onnx", "--weights", weights)
+    said = fail(capsys, 1, "export", "--out", tmp_path / "cloth.onnx", "--weights", weights)
     assert "descriptors differ from torch's by 1.0e+00" in said
     assert list(tmp_path.iterdir()) == []
 
 
 def test_onnx_needs_its_ending(weights, capsys, tmp_path):
-    assert "path must end with .onnx" in fail(capsys, 2, "export", tmp_path / "cloth.pt", "--weights", weights)
+    assert "must end with .onnx" in fail(capsys, 2, "export", "--out", tmp_path / "cloth.pt", "--weights", weights)
 
 
 def test_weights_without_heads_are_measured_from_the_command_line(weights, cloth_dataset, capsys, tmp_path):

@@ -13,10 +13,13 @@ from pathlib import Path
 
 import pytest
 
+from mmgsd.config import OBJECTS
+from mmgsd.paths import find_samples
+
 ROOT = Path(__file__).resolve().parents[1]
 SAMPLE = ROOT / "data" / "sample" / "cloth" / "images"
 IMAGES = [str(SAMPLE / f"test_{name}_00.webp") for name in ("000007", "000002")]
-SOURCES = ("pyproject.toml", "README.md", "LICENSE", "mmgsd", "data/weights")
+SOURCES = ("pyproject.toml", "README.md", "LICENSE", "mmgsd", "data/weights", "data/sample")
 NEWER = re.compile(  # than Python 3.10; of the syntax, ruff tells
     r"file_digest|datetime\.UTC|StrEnum|tomllib|typing import .*\b(Self|override|Never)\b|catch_warnings\(\w"
     r"|itertools\.batched|ExceptionGroup|asyncio\.(TaskGroup|timeout)|contextlib\.chdir|math\.(cbrt|exp2|sumprod)|\.walk\("
@@ -84,10 +87,11 @@ def run_installed(folder: Path, cwd: Path, code: str, *arguments: str) -> subpro
 def test_the_wheel_holds_every_module_and_the_shipped_weights(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         held = {name for name in archive.namelist() if ".dist-info/" not in name}
-    kinds = {".py", ".js", ".css"}
+    kinds = {".py", ".js", ".css", ".typed"}
     modules = {str(path.relative_to(ROOT)) for path in (ROOT / "mmgsd").rglob("*") if path.suffix in kinds}
     shipped = {f"mmgsd/weights/{path.name}" for path in (ROOT / "data" / "weights").iterdir() if path.suffix != ".py"}
-    assert held == modules | shipped
+    samples = {f"mmgsd/samples/{name}/{path.name}" for name in OBJECTS for path in find_samples(name)}
+    assert held == modules | shipped | samples
 
 
 def test_the_modules_do_without_what_python_3_10_lacks() -> None:
@@ -109,6 +113,26 @@ def test_the_command_answers_with_an_installed_model(installed: Path, tmp_path: 
     done = run_installed(installed, tmp_path, COMMAND, *asked)
     assert done.returncode == 0, done.stderr
     assert len(json.loads(done.stdout)[0]["modes"]) == 4
+
+
+def read_block(start: str) -> str:
+    """README's first block of code that begins so."""
+    return re.search(rf"^```\w+\n({start}.*?)^```", (ROOT / "README.md").read_text("utf-8"), re.M | re.S)[1]
+
+
+def test_the_readmes_first_lines_run_in_an_empty_folder(installed: Path, tmp_path: Path) -> None:
+    code = read_block("import mmgsd") + "\nprint(match.modes.shape, both.modes.shape)"
+    done = run_installed(installed, tmp_path, code)
+    assert (done.returncode, done.stdout) == (0, "(1, 4, 2) (2, 4, 2)\n"), done.stderr
+
+
+def test_the_readmes_first_command_runs_in_an_empty_folder(installed: Path, tmp_path: Path) -> None:
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("MMGSD_")}
+    environment |= {"PYTHONPATH": str(installed), "PATH": f"{installed / 'bin'}:{os.environ['PATH']}"}
+    for command in read_block("mmgsd match").splitlines():
+        done = subprocess.run(["bash", "-c", command], cwd=tmp_path, env=environment, capture_output=True, text=True)
+        assert (done.returncode, done.stderr) == (0, ""), command
+        assert "px" in done.stdout
 
 
 def test_a_picture_without_matplotlib_names_the_extra_to_install(installed: Path, tmp_path: Path) -> None:

@@ -9,7 +9,9 @@ wrong.
 
 from __future__ import annotations
 
+import base64
 import dataclasses
+import io
 import json
 import logging
 import time
@@ -24,6 +26,7 @@ import traitlets
 
 from mmgsd.experiments import get_label
 from mmgsd.extras.explorer_scenes import Scene
+from mmgsd.figures.plots import plot_samples
 from mmgsd.figures.style import FADED, HEAT, compute_ellipse, compute_strength, fade_image
 from mmgsd.images import decode_image
 from mmgsd.match.baselines import FeatureMatcher
@@ -54,9 +57,16 @@ class Pictures(anywidget.AnyWidget):
     together = traitlets.Bool(False).tag(sync=True)  # whether all points are answered under one member of the symmetry
     heat_colours = traitlets.Bytes((255 * HEAT).astype(np.uint8).tobytes()).tag(sync=True)  # 256 times R, G, B
 
+    still: Callable[[], bytes] = bytes  # makes a JPEG of what is seen
+
     def __repr__(self) -> str:
-        """What stands in a notebook where no widget can be shown."""
+        """What stands in a notebook where neither a widget nor a picture can be shown."""
         return "the explorer (run this cell to see it)"
+
+    def _repr_mimebundle_(self, **kwargs: Any) -> tuple[dict, dict]:
+        """The widget, and a picture for where nothing runs, as on a page that shows a notebook."""
+        data, metadata = super()._repr_mimebundle_(**kwargs)
+        return data | {"image/jpeg": base64.b64encode(self.still()).decode()}, metadata
 
 
 class Explorer:
@@ -73,12 +83,20 @@ class Explorer:
         self.rng, self._own, self._parts, self.marks = np.random.default_rng(), None, {}, {}
         methods = [[name, get_label(name, short=True)] for name in self.matchers]
         self.pictures = Pictures(methods=methods, method=methods[0][0])
+        self.pictures.still = self._draw
         self.pictures.on_msg(self._on_message)
         self.open(0)
 
     def show(self) -> Pictures:
         """The widget to put on the page."""
         return self.pictures
+
+    def _draw(self) -> bytes:
+        """A JPEG of the last answer, or of the two images."""
+        images, written = [self.scene.image0, self.scene.image1], io.BytesIO()
+        figure = plot_samples(images, columns=2) if self.answer is None else self.answer.plot(len(self.answer) - 1)
+        figure.savefig(written, format="jpeg", bbox_inches="tight")
+        return written.getvalue()
 
     def open(self, index: int) -> None:
         """Show one of the pairs; where it cannot be read, the last one stays."""
@@ -165,13 +183,22 @@ class Explorer:
         """Have the chosen method answer for all points, and the browser draw what it says."""
         start, match = time.perf_counter(), None
         if points:
-            match = self._get_answering()(np.array(points), joint=self.together)
+            answer = self._get_answering()
+            match = answer(np.array(points), joint=True) if self._check_together() else answer(np.array(points))
         shown = {"json": "[]", "points": []} if match is None else show_answer(match, self.scene)
         self.milliseconds = 1000 * (time.perf_counter() - start)
         self.answers += 1
         about = {"pair": self.pairs_opened, "number": self.answers, "milliseconds": round(self.milliseconds)}
         self.answer, self.pictures.answer = match, about | shown
         return match
+
+    def _check_together(self) -> bool:
+        """Whether all points are to be answered together; ValueError, in the page's words, where the method cannot."""
+        matcher = self.matchers[self.method]
+        if self.together and (isinstance(matcher, FeatureMatcher) or not matcher.config.heads):
+            raise ValueError(f"together must be off for {get_label(self.method, short=True)}, which has not learnt "
+                             "where the object is: choose another method")  # fmt: skip
+        return self.together
 
     def _get_answering(self) -> Callable[..., Match]:
         """The chosen method, its descriptors of this pair computed once."""
@@ -276,10 +303,8 @@ def prepare_baseline(matcher: FeatureMatcher, scene: Scene) -> Callable[..., Mat
         for image, less in zip((scene.image0, scene.image1), small, strict=True)
     )
 
-    def answer(xy: np.ndarray, *, joint: bool = False) -> Match:
+    def answer(xy: np.ndarray) -> Match:
         """The answer about pixels of the whole image, from that about the small one."""
-        if joint:
-            raise ValueError("together must be off for this method: trained weights alone answer points together")
         found = matcher.match(*small, (xy + 0.5) / ratio0 - 0.5, mask1=mask)
         back = {
             "modes": (found.modes + 0.5) * ratio1 - 0.5,

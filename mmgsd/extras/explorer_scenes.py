@@ -60,7 +60,7 @@ def make_scenes(data: Dataset, *, pairs: int = 50, seed: int = 0) -> list[Callab
     def make(first: int, second: int) -> Scene:
         """The scene of two images, by their indices."""
         orbits = [data.xy[second][group.distinct_modes(point)] for point in range(group.n_points)]
-        names = (f"{data.object}, image {index}" for index in (first, second))
+        names = (Path(data.labels.file.iloc[index]).name for index in (first, second))
         images = data.load_image(first), data.load_image(second)
         seen = np.where(data.visible[first][:, None], data.xy[first], np.inf)
         return Scene(*images, *names, data.load_mask(second), seen, orbits)

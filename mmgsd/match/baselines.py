@@ -25,7 +25,7 @@ from mmgsd.checks import check_choice
 from mmgsd.images import check_pixels, check_question
 from mmgsd.match.features import Extractor, extract_dinov2, extract_imagenet, sample_features
 from mmgsd.match.match import Match
-from mmgsd.match.matcher import make_match
+from mmgsd.match.matcher import fill_question, make_match
 from mmgsd.match.mixture import check_modes
 
 EXTRACTORS: dict[str, Extractor] = {"imagenet": extract_imagenet, "dinov2": extract_dinov2}
@@ -89,9 +89,9 @@ class FeatureMatcher:
         cells, centres = self.compute_heatmaps(image0, image1, points, mask1)
         return make_match(image0, image1, points, cells, centres, n, fitted=self.modes)
 
-    def match_many(self, questions: Iterable[tuple[Any, Any, Any]], *, n: Any = None) -> Iterator[Match]:
-        """As `Matcher.match_many`."""
-        return (self.match(image0, image1, xy, n=n) for image0, image1, xy in questions)
+    def match_many(self, questions: Iterable[tuple[Any, ...]], *, n: Any = None) -> Iterator[Match]:
+        """As `Matcher.match_many`; what a mask0 says is not needed."""
+        return (self.match(*asked, n=n, mask1=mask1) for *asked, _, mask1 in map(fill_question, questions))
 
 
 class BaselineMatcher(FeatureMatcher):

@@ -25,11 +25,15 @@ SHARED = (
 
 @dataclass(frozen=True)
 class Best:
-    """The one mode of each of S queries to act on; NaN where the answer is not sure enough."""
+    """The one mode of each of S queries for a single pick.
 
-    xy: np.ndarray  # (S, 2) px in image1
-    spread_px: np.ndarray  # (S,) std of the mode, root mean square over directions
-    confidence: np.ndarray  # (S,) in [0, 1]
+    ``xy`` (S, 2) px in image1, NaN where the answer is not sure enough; ``spread_px`` (S,) its std, root mean square
+    over directions; ``confidence`` (S,) in [0, 1], as `Match.confidence`.
+    """
+
+    xy: np.ndarray
+    spread_px: np.ndarray
+    confidence: np.ndarray
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -37,27 +41,43 @@ class Match:
     """The answer to S queries; pixels are those of the caller's images.
 
     ``len`` counts the queries; an index, negative ones too, a slice, an array of indices or a boolean mask takes some
-    of them, and a loop goes through them one by one: each gives a `Match`.
+    of them, and a loop goes through them one by one: each gives a `Match`. Its fields:
+
+    ``image0``, ``image1``  (H, W, 3) uint8 RGB each.
+    ``xy``  (S, 2) px in image0.
+    ``modes``  (S, n, 2) px in image1, most probable first, or as ``joint`` says; NaN for absent ones.
+    ``weights``  (S, n), sum to 1 over the modes that are here, also where fewer were kept than fitted.
+    ``covariances``  (S, n, 2, 2) px².
+    ``entropy``  (S,) nats, of the density over px of a training image, whatever the size of image1.
+    ``outside``  (S,) in [0, 1], heatmap mass outside the 95 % ellipses of all modes that were fitted.
+    ``cells``  (S, h, w), the heatmap on the descriptors' grid; each sums to 1.
+    ``visible``  (S, n) in [0, 1], whether each mode's match is seen there, or hidden.
+    ``on_object``  (S,) in [0, 1], whether the pixel asked about shows the object.
+    ``absent``  (S,) in [0, 1], whether image1 does not show the object at all.
+    ``joint``  (n,) of a joint answer: modes[:, g] are of one member of the symmetry, and weigh so much over the whole
+    object, on average; the heaviest first. None: each query has an order of its own.
+    ``scale``  px of image1 by px of an image of the size that the model was taught with.
+    ``calibration``  what ellipses, radii and confidences promise; None: what a Gaussian would.
+
+    ``visible``, ``on_object`` and ``absent`` are None where what answered does not know them: weights that learnt no
+    mask, hand-made descriptors.
     """
 
-    image0: np.ndarray  # (H0, W0, 3) uint8
-    image1: np.ndarray  # (H1, W1, 3) uint8
-    xy: np.ndarray  # (S, 2) px in image0
-    modes: np.ndarray  # (S, n, 2) px in image1, most probable first, or as ``joint`` says; NaN for absent ones
-    weights: np.ndarray  # (S, n), sum to 1 over the modes that are here, also where fewer were kept than fitted
-    covariances: np.ndarray  # (S, n, 2, 2) px²
-    entropy: np.ndarray  # (S,) nats, of the density over px of a training image, whatever the size of image1
-    outside: np.ndarray  # (S,) heatmap mass outside the 95 % ellipses of all modes that were fitted, in [0, 1]
-    cells: np.ndarray  # (S, h, w) heatmap on the descriptors' grid, sums to 1
-    # None of what made the answer does not know it: weights that learnt no mask, hand-made descriptors
-    visible: np.ndarray | None = None  # (S, n) in [0, 1], whether each mode's match is seen there, or hidden
-    on_object: np.ndarray | None = None  # (S,) in [0, 1], whether the pixel asked about shows the object
-    absent: np.ndarray | None = None  # (S,) in [0, 1], whether image1 does not show the object at all
-    # (n,) of a joint answer: modes[:, g] are of one member of the symmetry, and weigh so much over the whole object, on
-    # average; the heaviest first. None: each query has an order of its own
+    image0: np.ndarray
+    image1: np.ndarray
+    xy: np.ndarray
+    modes: np.ndarray
+    weights: np.ndarray
+    covariances: np.ndarray
+    entropy: np.ndarray
+    outside: np.ndarray
+    cells: np.ndarray
+    visible: np.ndarray | None = None
+    on_object: np.ndarray | None = None
+    absent: np.ndarray | None = None
     joint: np.ndarray | None = None
-    scale: float = 1.0  # px of image1 by px of an image of the size that the model was taught with
-    calibration: Calibration | None = None  # None: ellipses, radii and confidences promise what a Gaussian would
+    scale: float = 1.0
+    calibration: Calibration | None = None
 
     @cached_property
     def heatmap(self) -> np.ndarray:
@@ -125,6 +145,8 @@ class Match:
     def best(self, *, min_confidence: float = 0.0, radius_px: float | None = None) -> Best:
         """The mode with the least spread of each query: which of the like places to grasp (paper introduction).
 
+        For one pick. Picks and places that belong together may take modes of different members of the symmetry: ask
+        for them with ``joint``, or use `mmgsd.fold.moves.answer_picture`.
         One that is seen is preferred to one that is hidden, where that is known. Abstains, with NaN for ``xy``, where a
         true match lies within ``radius_px`` (as in `confidence`) with less than ``min_confidence``, where the pixel
         asked about is more likely background, and where the object is more likely not in image1.

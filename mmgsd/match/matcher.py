@@ -191,7 +191,8 @@ class Matcher:
     ) -> Match:  # fmt: skip
         """All matches in ``image1`` of the pixels ``xy`` (S, 2), or of the one pixel (2,), of ``image0``.
 
-        Images are of any size and each of its own, paths or of any kind that `mmgsd.images.to_rgb` takes, and copied.
+        Images are RGB, not OpenCV's BGR, of any size and each of its own, paths or of any kind that
+        `mmgsd.images.to_rgb` takes; they are copied.
         ``n`` modes are returned, one number for all or (S,), by default as many as the symmetry group has members;
         "auto" finds their number. The group's number is fitted even where fewer are asked for: of these the most
         probable are the answer, and their weights are divided by their sum. ``mask0`` and ``mask1``, (H, W) bool each,
@@ -210,16 +211,18 @@ class Matcher:
         return self._prepare(image0, image1, self.describe, mask0=mask0, mask1=mask1)
 
     def match_many(
-        self, questions: Iterable[tuple[Any, Any, Any]], *, n: Any = None, joint: bool = False
+        self, questions: Iterable[tuple[Any, ...]], *, n: Any = None, joint: bool = False
     ) -> Iterator[Match]:
-        """The answers to many questions (image0, image1, xy), each when it is asked for, so in little memory.
+        """The answers to many questions, each when it is asked for, so in little memory.
 
-        An image that comes again soon, by its pixels, is described once: a reference before many frames. ``n``,
+        A question is (image0, image1, xy), or (image0, image1, xy, mask0, mask1) with None for a mask that there is
+        not. An image that comes again soon, by its pixels, is described once: a reference before many frames. ``n``,
         ``joint`` and errors are those of `match`; after an error there is no further answer.
         """
         recent = _Recent(self.describe)
-        for image0, image1, xy in questions:
-            yield self._prepare(image0, image1, recent.describe).match(xy, n=n, joint=joint)
+        for image0, image1, xy, mask0, mask1 in map(fill_question, questions):
+            pair = self._prepare(image0, image1, recent.describe, mask0=mask0, mask1=mask1)
+            yield pair.match(xy, n=n, joint=joint)
 
     def _prepare(
         self, image0: Any, image1: Any, describe: Callable[[list[np.ndarray]], list[Outputs]], *, mask0: Any = None,
@@ -332,6 +335,15 @@ def find_weights(weights: Path | str) -> Path:
     if str(weights) not in shipped and not path.exists():
         raise FileNotFoundError(f"{weights} must be a safetensors file or one of {', '.join(map(repr, shipped))}")
     return shipped.get(str(weights), path)
+
+
+def fill_question(question: Iterable[Any]) -> tuple[Any, Any, Any, Any, Any]:
+    """(image0, image1, xy, mask0, mask1) of a question, None for masks that it lacks; ValueError for another length."""
+    given = tuple(question)
+    if len(given) not in (3, 5):
+        raise ValueError("questions must be (image0, image1, xy) or (image0, image1, xy, mask0, mask1) each, "
+                         f"got {len(given)} values")  # fmt: skip
+    return (*given, None, None)[:5]
 
 
 def make_match(

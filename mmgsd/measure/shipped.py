@@ -29,6 +29,7 @@ from mmgsd.checks import read_count
 from mmgsd.command import run_command
 from mmgsd.config import OBJECTS, PRESETS, EvaluateConfig, Preset, load_preset
 from mmgsd.dataset import load_dataset
+from mmgsd.dataset_format import SPLITS
 from mmgsd.experiments import configure_study
 from mmgsd.files import read_json, write_json
 from mmgsd.learn.checkpoints import WEIGHTS
@@ -39,6 +40,7 @@ from mmgsd.match.match import RADIUS_PX, Match
 from mmgsd.match.matcher import Matcher, find_weights
 from mmgsd.match.mixture import Reading
 from mmgsd.measure.evaluation import evaluate_baseline, evaluate_model, load_queries, read_results
+from mmgsd.measure.figure_data import PLAIN
 from mmgsd.measure.heads import MEASURES as HEADS
 from mmgsd.measure.heads import evaluate_heads
 from mmgsd.measure.metrics import aggregate
@@ -57,6 +59,7 @@ SETS = ("paper", "workspace")  # presets whose test images are asked about
 LEVEL = 0.9  # of the radii whose promise is checked
 HEAD_PAIRS = 100  # of images whose modes are judged
 TIMED = 9  # questions, of which the median counts
+SIDE_POINTS = {"cloth": 25, "rope": 625}  # material points, the first ones, that lie along it
 RESULTS = "shipped.json"
 
 
@@ -141,14 +144,24 @@ def _list_reliability(modes: pd.DataFrame, promise: Calibration | None) -> dict[
 
 
 def _time_question(matcher: Matcher, root: Path) -> dict[str, Any]:
-    """Median time of one question about two images that were not seen before, and what it ran on."""
+    """Median time of one question about two images that were not seen before, what it ran on, the object's size."""
     data, seconds = load_dataset(root / "data" / "sample" / matcher.object, "test"), []
     images = [data.load_image(index) for index in range(2)]
     for _ in range(TIMED):
         start = time.perf_counter()
         matcher.match(*images, [[s / 2 for s in data.size]])
         seconds.append(time.perf_counter() - start)
-    return {"milliseconds": round(1000 * statistics.median(seconds), 1), "hardware": name_hardware(matcher.device)}
+    return {"milliseconds": round(1000 * statistics.median(seconds), 1), "hardware": name_hardware(matcher.device),
+            "side_px": measure_side(data.folder)}  # fmt: skip
+
+
+def measure_side(folder: Path) -> float:
+    """px of a flat cloth's side, or a straight rope's length: the median over a data set's images of these."""
+    lengths = []
+    for data in (load_dataset(folder, split) for split in SPLITS):
+        along = data.xy[data.labels.state.isin(PLAIN).to_numpy(), : SIDE_POINTS[data.object]]
+        lengths.extend(np.linalg.norm(np.diff(along, axis=1), axis=-1).sum(1))
+    return round(float(np.median(lengths)), 1)
 
 
 class Masked:

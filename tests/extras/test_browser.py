@@ -123,6 +123,24 @@ def test_what_is_hidden_or_absent_is_said(bare: Any) -> None:
     assert (look(bare) != faint).any()
 
 
+@pytest.mark.parametrize("width", [700, 1000, 1400, 1900])
+def test_tables_of_points_lie_apart_and_are_as_wide_as_their_content(bare: Any, width: int) -> None:
+    bare.set_viewport_size({**VIEWPORT, "width": width})
+    answer = make_answer(1, (40, 50), (60, 50), (80, 50))
+    queries = json.loads(answer["json"])
+    for query in queries:
+        query["modes"] = 4 * [query["modes"][0] | {"visible": 0.999, "xy": [1150.4, 1150.4], "spread_px": 104.0}]
+    points = [point | {"ellipses": 4 * point["ellipses"]} for point in answer["points"]]
+    show(bare, "answer", {**answer, "json": json.dumps(queries), "points": points})
+    tables = bare.locator(".mmgsd-tables table")
+    boxes = tables.evaluate_all("all => all.map(one => [...Object.values(one.getBoundingClientRect().toJSON())])")
+    content = tables.evaluate_all("all => all.map(one => one.scrollWidth)")
+    bare.set_viewport_size(VIEWPORT)
+    for (x, y, across, *_), needed in zip(boxes, content, strict=True):
+        assert across + 1 >= needed
+        assert not any(ox < x + across and x < ox + oa and oy == y for ox, oy, oa, *_ in boxes if (ox, oy) != (x, y))
+
+
 def test_answers_that_belong_together_are_chosen_one_at_a_time(bare: Any) -> None:
     answers = bare.get_by_label("answer", exact=True)
     assert answers.is_hidden()

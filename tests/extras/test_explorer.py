@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import io
 import json
 from pathlib import Path
@@ -11,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from matplotlib import pyplot as plt
 from PIL import Image
 
 import mmgsd
@@ -222,18 +224,39 @@ def test_another_method_answers_for_the_same_points(explorer: Explorer) -> None:
 
 def test_points_are_answered_together_where_the_weights_can(explorer: Explorer) -> None:
     tell(explorer, "ask", xy=[240, 200], pin=True)
-    assert "mask0" in tell(explorer, "together", on=True)  # an untrained network knows no mask
+    assert tell(explorer, "together", on=True).startswith("together must be off for MMGSD")  # it knows no mask
     assert explorer.pictures.together is explorer.together is False and explorer.pictures.answer["joint"] == []
-    images = explorer.scene.image0, explorer.scene.image1
-    explorer._prepared["mmgsd"] = mmgsd.load("cloth").prepare(*images).match
+    explorer.matchers["mmgsd"] = mmgsd.load("cloth")
+    explorer._prepared.clear()
     assert tell(explorer, "together", on=True) is None
     assert tell(explorer, "ask", xy=[200, 240], pin=True) is None
     sent = explorer.pictures.answer
     assert len(sent["joint"]) == 4 and sum(sent["joint"]) == pytest.approx(1, abs=1e-3)
     assert [[mode["answer"] for mode in query["modes"]] for query in json.loads(sent["json"])] == [[1, 2, 3, 4]] * 2
-    assert "together must be off for this method" in tell(explorer, "method", name="sift")
+    assert tell(explorer, "method", name="sift").startswith("together must be off for SIFT")
     assert explorer.method == "mmgsd" and tell(explorer, "together", on=False) is None
     assert "answer" not in json.loads(explorer.pictures.answer["json"])[0]["modes"][0]
+
+
+@pytest.mark.parametrize("asked", [False, True])
+def test_where_no_widget_can_be_shown_there_is_a_picture(explorer: Explorer, asked: bool) -> None:
+    if asked:
+        explorer.ask(240, 200)
+    data, _ = explorer.show()._repr_mimebundle_()
+    picture = np.asarray(Image.open(io.BytesIO(base64.b64decode(data["image/jpeg"]))))
+    assert "application/vnd.jupyter.widget-view+json" in data
+    assert picture.shape[1] > 400 and picture.std() > 20
+    assert plt.get_fignums() == []
+
+
+def test_marks_of_the_samples_images_name_their_files(explorer: Explorer, cloth_dataset: Path) -> None:
+    xy = explorer.scene.xy0[np.isfinite(explorer.scene.xy0).all(1)][:4]
+    for point in xy:
+        assert tell(explorer, "ask", xy=point.tolist(), pin=True) is None
+    tell(explorer, "step", to="next")
+    assert tell(explorer, "ask", xy=[240, 200], pin=True) is None
+    entries = json.loads(explorer.pictures.marks)
+    assert len(entries) == 2 and all((cloth_dataset / "images" / entry["file"]).is_file() for entry in entries)
 
 
 def test_a_method_that_fails_is_not_taken(explorer: Explorer) -> None:

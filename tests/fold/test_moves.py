@@ -64,8 +64,11 @@ def test_the_surest_modes_of_a_picture_are_those_of_each_pixel(data, demonstrati
 
 def test_the_command_prints_pixels_and_rays(data, written, capsys) -> None:
     image = str(SAMPLE / data.labels.file[NOW])
-    main(["fold", str(written), image, "--weights", "cloth", "--json", "--intrinsics", "900,900,242,242"])
+    asked = ["fold", str(written), image, "--weights", "cloth", "--json", "--intrinsics"]
+    main([*asked, "900,900,242,242"])
     said = json.loads(capsys.readouterr().out)
+    main([*asked, "900,0,242,0,900,242,0,0,1"])
+    assert json.loads(capsys.readouterr().out) == said
     assert said["agreement"] == 1 and find_error(data, np.array([move["pick"] for move in said["moves"]])) < 15
     assert all(np.linalg.norm(move[ray]) == pytest.approx(1, abs=1e-4)
                for move in said["moves"] for ray in ("pick_ray", "place_ray"))  # fmt: skip

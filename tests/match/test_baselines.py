@@ -212,6 +212,8 @@ def test_features_of_ones_own_are_looked_for_on_the_object():
     match = FeatureMatcher(encode_colours).match(image0, image1, (60, 60), mask1=mask)
     assert np.linalg.norm(match.modes[0, 0] - (190, 50)) < 16
     assert not match.cells[0, :, :7].any()
+    (many,) = FeatureMatcher(encode_colours).match_many([(image0, image1, (60, 60), None, mask)])
+    np.testing.assert_array_equal(many.cells, match.cells)
 
 
 @pytest.mark.parametrize(

@@ -30,9 +30,16 @@ def test_what_is_behind_or_unknown_has_no_pixel() -> None:
     assert np.isnan(compute_rays([np.nan, 3], INTRINSICS)).all()
 
 
-@pytest.mark.parametrize("bad", [np.eye(2), np.zeros((3, 3)), np.arange(9)])
-def test_no_intrinsics(bad: np.ndarray) -> None:
-    with pytest.raises(ValueError, match="intrinsics must be a 3 x 3 matrix whose last row is 0 0 1, got"):
+@pytest.mark.parametrize("given", [INTRINSICS, INTRINSICS.ravel(), INTRINSICS.tolist(), (500, 500, 242, 242)])
+def test_intrinsics_are_a_matrix_its_numbers_or_four(given: object) -> None:
+    np.testing.assert_array_equal(compute_rays([7, 9], given), compute_rays([7, 9], INTRINSICS))
+    np.testing.assert_array_equal(compute_pixels([1, 2, 3], given), compute_pixels([1, 2, 3], INTRINSICS))
+
+
+@pytest.mark.parametrize("bad", [np.zeros((3, 3)), np.arange(9), np.eye(4), 5, (1, 2, 3), (0, 500, 242, 242), np.eye(2),
+                                 (500, np.nan, 242, 242), (500, -500, 242, 242), np.diag([0, 5, 1])])  # fmt: skip
+def test_no_intrinsics(bad: object) -> None:
+    with pytest.raises(ValueError, match="intrinsics must be a 3 x 3 matrix .* or fx, fy, cx, cy"):
         compute_rays([1, 2], bad)
 
 

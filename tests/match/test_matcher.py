@@ -396,6 +396,24 @@ def test_many_questions_are_answered_as_each_alone_and_an_image_is_described_onc
         np.testing.assert_allclose(answer.modes, alone.modes, atol=0.5)
 
 
+def test_many_questions_take_masks(matcher: Matcher, rng: np.random.Generator) -> None:
+    images = rng.integers(0, 255, (2, 60, 80, 3), dtype=np.uint8)
+    left = np.zeros((60, 80), bool)
+    left[:, :40] = True
+    masks = [(left, ~left), (None, left), (~left, None)]
+    answers = matcher.match_many([(*images, [(5, 6)], *pair) for pair in masks] + [(*images, [(5, 6)])])
+    for answer, (mask0, mask1) in zip(answers, [*masks, (None, None)], strict=True):
+        alone = matcher.match(*images, [(5, 6)], mask0=mask0, mask1=mask1)
+        np.testing.assert_allclose(answer.cells, alone.cells, atol=1e-4)
+        assert (answer.on_object is None) == (mask0 is None)
+
+
+@pytest.mark.parametrize("length", [0, 2, 4, 6])
+def test_a_question_of_another_length_is_refused(matcher: Matcher, image: np.ndarray, length: int) -> None:
+    with pytest.raises(ValueError, match=f"questions must be .* got {length} values"):
+        next(matcher.match_many([(image, image, [(5, 6)], None, None, None)[:length]]))
+
+
 def test_a_refilled_array_is_another_image(matcher: Matcher, rng: np.random.Generator) -> None:
     buffer = np.zeros((60, 80, 3), np.uint8)
 

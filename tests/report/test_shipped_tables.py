@@ -8,6 +8,7 @@ from mmgsd.report.shipped import (
     make_by_source_table,
     make_counts_sentence,
     make_knowledge_table,
+    make_limits_table,
     make_parts_table,
     make_pictures_table,
     make_readings_table,
@@ -24,9 +25,9 @@ ROWS = {
     "cloth-daisy": {"paper": {"rmse_mean": 71.25}},
     "cloth-paper": {"calibrated": False, "paper": {"rmse_mean": 26.1}, "workspace": {"rmse_mean": 88.0}},
     "cloth": {"calibrated": True, "paper": SET, "workspace": SET, "photographs": FOUND, "milliseconds": 120.4,
-              "hardware": "CPU, 2 cores"},
+              "hardware": "CPU, 2 cores", "object": "cloth", "side_px": 300.0},
     "rope": {"calibrated": True, "photographs": FOUND | {"photographs": 32}, "milliseconds": 140.4,
-             "hardware": "CPU, 2 cores"},
+             "hardware": "CPU, 2 cores", "object": "rope", "side_px": 400.0},
 }  # fmt: skip
 
 
@@ -88,3 +89,11 @@ def test_each_repository_is_a_row_and_what_it_lacks_a_dash() -> None:
         "| cloth, `a/b` | 12 | 20 % | 45 % | 83 % | 30 % | 12.0 % |",
         "| rope, `c/d` | – | – | – | – | – | – |",
     ]
+
+
+def test_limits_are_in_px_shares_of_the_side_and_milliseconds() -> None:
+    lines = make_limits_table(ROWS).splitlines()
+    assert "| mean error, clean renders | cloth 21 px, 7 % of its side; rope –, – of its length |" in lines
+    assert "51 % of a cloth's corners" in lines[5] and "140 ms" in lines[6] and "never tried" in lines[7]
+    unsized = ROWS | {"cloth": {key: value for key, value in ROWS["cloth"].items() if key != "side_px"}}
+    assert "cloth 21 px, – of its side" in make_limits_table(unsized)
