@@ -9,7 +9,7 @@ from pathlib import Path
 
 import mmgsd
 from mmgsd import cli
-from mmgsd.command import describe_error
+from mmgsd.command import describe_error, wants_traceback
 from mmgsd.config import MAX_MODES
 
 EXAMPLE = "example: python -m mmgsd match towel1.jpg towel2.jpg --xy 212,148 --weights FILE --out match.png"
@@ -24,6 +24,9 @@ def main(arguments: list[str] | None = None) -> None:
     """
     parser = make_parser()
     args = parser.parse_args(arguments)
+    os.environ["MPLBACKEND"] = "Agg"  # another environment's, such as a notebook's, may be missing in this one
+    if wants_traceback():
+        return args.run(args)
     try:
         args.run(args)
     except KeyboardInterrupt:
