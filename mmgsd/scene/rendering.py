@@ -57,6 +57,14 @@ BATCH = re.compile(r"(train|test)_\d+\.(zip|tmp)(\.damaged)?|config\.(json|tmp)(
 LABELS = {"episode", "view", "split", "xy", "visible", "intrinsics", "camera_pose", "info"}  # of a view in a batch
 UNREADABLE = (OSError, EOFError, ValueError, TypeError, LookupError, AttributeError, NotImplementedError, RuntimeError,
               zipfile.BadZipFile, zlib.error)  # fmt: skip  # what zipfile raises about a damaged archive
+# Our package is found where this one was; what else lies there or in the working directory, a bpy.py say, is not.
+CHILD = """
+import runpy, sys
+sys.path.insert(0, sys.argv[2])
+import mmgsd
+del sys.path[0]
+runpy.run_module(sys.argv[1], run_name="__main__")
+"""
 
 _children: set[subprocess.Popen] = set()  # that render for this process now
 
@@ -165,14 +173,15 @@ def render_batch(job: dict) -> bytes:
 
 def run_child(job: dict, folder: Path) -> tuple[int, str]:
     """Exit code and stderr of a child that renders ``job``, with ``folder`` for all its temporary files."""
-    path = os.pathsep.join([str(Path(__file__).resolve().parents[2]), os.environ.get("PYTHONPATH", "")])
+    place = str(Path(__file__).resolve().parents[2])
+    path = os.pathsep.join(filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep)))  # an empty one is the cwd
     # as many children as cores, so one thread in each
     one = {"MMGSD_THREADS": "1", "OMP_NUM_THREADS": "1", "OIDN_NUM_THREADS": "1", "OIDN_SET_AFFINITY": "0"}
-    env = {**one, **os.environ, "PYTHONPATH": path, "TMPDIR": str(folder)}
+    env = {**one, **os.environ, "PYTHONSAFEPATH": "1", "PYTHONPATH": path, "TMPDIR": str(folder)}
     pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
     # a session of its own: Ctrl-C stops the parent, which ends its children, and none of them fails and is tried again
     with subprocess.Popen(
-        [sys.executable, "-m", "mmgsd.scene"], env=env, text=True, start_new_session=True, **pipes
+        [sys.executable, "-c", CHILD, "mmgsd.scene", place], env=env, text=True, start_new_session=True, **pipes
     ) as child:
         _children.add(child)
         try:
