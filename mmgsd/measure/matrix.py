@@ -16,10 +16,10 @@ import argparse
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from dask.distributed import Client, as_completed
 from tqdm.auto import tqdm
 
 from mmgsd.checks import read_count
+from mmgsd.cluster import open_client, wait_for_each
 from mmgsd.command import run_command
 from mmgsd.config import OBJECTS, Preset, TrainConfig, load_preset
 from mmgsd.experiments import (
@@ -112,12 +112,12 @@ def run_tasks(tasks: list[Task], preset: Preset, root: Path, *, scheduler: str =
     if not scheduler:
         yield from (run_task(task, preset, root, progress=True) for task in tasks)
         return
-    with Client(scheduler) as client:
+    with open_client(scheduler) as client:
         futures = {}
         for i, task in enumerate(tasks):
             after = next((futures.get(start.name) for start in reversed(_find_start(task, preset))), None)
             futures[name_task(task)] = client.submit(run_task, task, preset, root, after, pure=False, priority=-i)
-        yield from (future.result() for future in as_completed(futures.values()))
+        yield from (future.result() for future in wait_for_each(client, futures.values()))
 
 
 def write_tables(preset: Preset, root: Path) -> None:

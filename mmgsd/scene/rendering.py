@@ -23,10 +23,11 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from dask.distributed import Client, LocalCluster, as_completed
+from dask.distributed import Client, LocalCluster
 from dask.system import cpu_count
 
 from mmgsd.checks import read_count, read_flag
+from mmgsd.cluster import open_client, wait_for_each
 from mmgsd.config import DEFAULT_GROUP, OBJECTS, OWN_GROUP, RenderConfig, list_later, to_dict
 from mmgsd.dataset import load_dataset
 from mmgsd.dataset_format import FORMAT, SPLITS, encode_table, find_owner, is_member
@@ -208,7 +209,7 @@ def connect(workers: int, scheduler: str) -> Iterator[Client]:
     0 workers: as many as this process may use cores. At the end the children of this process are ended.
     """
     if scheduler:
-        with Client(scheduler) as client:
+        with open_client(scheduler) as client:
             yield client
         return
     threads = workers or cpu_count()  # they only wait for the children; affinity and quotas count
@@ -252,7 +253,7 @@ def _render_batches(client: Client, jobs: dict, partial: Path, config: RenderCon
     total = sum(n for job in jobs.values() for _, n in job["episodes"])
     try:
         with ProgressBar(total=total, desc=f"render {config.object}", unit="image", disable=not progress) as bar:
-            for future in as_completed(list(futures)):
+            for future in wait_for_each(client, list(futures)):
                 name = futures.pop(future)
                 write_bytes(partial / f"{name}.zip", future.result())
                 bar.update(sum(n for _, n in jobs[name]["episodes"]))
