@@ -16,8 +16,6 @@ import argparse
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from tqdm.auto import tqdm
-
 from mmgsd.checks import read_count
 from mmgsd.cluster import open_client, wait_for_each
 from mmgsd.command import run_command
@@ -46,6 +44,7 @@ from mmgsd.measure.evaluation import (
 )
 from mmgsd.parameters import read_scheduler
 from mmgsd.paths import Paths, find_root
+from mmgsd.progress import ProgressBar
 
 TABLES = ("budget", "robustness")  # studies with a file of their own, of the preset's models under their rows' names
 VALIDATIONS = 8  # RMSE on held-out simulations, in a model's log
@@ -244,8 +243,8 @@ def main() -> None:
         parser.error(f"--only {args.only!r}: no model or baseline of the preset {preset.name} has a name with that")
     scheduler = read_scheduler("--scheduler", args.scheduler)
     done = run_tasks(tasks, preset, find_root(), scheduler=scheduler)
-    for name, rmse in tqdm(done, total=len(tasks), desc="models and baselines"):
-        tqdm.write(f"{name}: {rmse:.1f} px")
+    for name, rmse in ProgressBar(done, total=len(tasks), desc="models and baselines"):
+        ProgressBar.write(f"{name}: {rmse:.1f} px")
         if args.seeds:
             write_seed_table(preset, find_root(), args.seeds, steps=args.steps)
         elif args.steps:
