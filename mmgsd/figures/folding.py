@@ -16,7 +16,6 @@ from PIL import Image
 from mmgsd.config import OBJECTS
 from mmgsd.figures.style import MARK, PAGE_IN, check_filled, finish_axes, make_grid, mark_pixel, styled
 from mmgsd.files import writing
-from mmgsd.fold.policies import POLICIES
 
 THUMBNAIL_PX = 160  # sides of a picture
 WRAPPED, ACROSS = 13, 120  # letters of a line beside such a picture, and of the lines above a row of them
@@ -50,6 +49,8 @@ def plot_success(results: Mapping[str, Any]) -> Figure:
 
     ``results`` as `mmgsd.fold.rollouts` stores them; a policy that was not measured has no dot. ValueError of none.
     """
+    from mmgsd.fold.policies import POLICIES  # needs more than drawing moves does
+
     rows = results["policies"]
     names = [name for name in POLICIES if any("reachable" in rows[object].get(name, {}) for object in OBJECTS)]
     check_filled("results", names)

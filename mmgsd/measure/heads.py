@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 import pandas as pd
 import torch
-from tqdm.auto import tqdm
 
 from mmgsd.checks import read_flag
 from mmgsd.config import EvaluateConfig, digest
@@ -22,6 +21,7 @@ from mmgsd.match.matcher import Matcher, read_heatmap
 from mmgsd.measure.metrics import assign_modes
 from mmgsd.measure.questions import choose_points, describe, draw_pairs
 from mmgsd.measure.uncertainty import compute_auroc
+from mmgsd.progress import ProgressBar
 
 MEASURES = ("mask_iou", "auroc_on_object", "auroc_visible", "auroc_absent", "auroc_absent_textile",
             "auroc_absent_clutter")  # fmt: skip
@@ -101,7 +101,7 @@ def _ask_modes(
     points, group = choose_points(config.points, data.n_points), data.group(matcher.config.group)
     orbits = group.permutations[:, points].T  # (P, n)
     scores, true = [np.empty(0)], [np.empty(0, bool)]
-    for first, second in tqdm(draw_pairs(data, config), desc="heads", disable=not progress, leave=False):
+    for first, second in ProgressBar(draw_pairs(data, config), desc="heads", disable=not progress, leave=False):
         seen = data.visible[first, points]
         xy, orbit = torch.from_numpy(data.xy[first, points[seen]]), orbits[seen]
         modes = _find_modes(matcher, said[first], said[second], xy, data.size, n=orbits.shape[1])

@@ -16,10 +16,8 @@ import argparse
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from dask.distributed import Client, as_completed
-from tqdm.auto import tqdm
-
 from mmgsd.checks import read_count
+from mmgsd.cluster import open_client, wait_for_each
 from mmgsd.command import run_command
 from mmgsd.config import OBJECTS, Preset, TrainConfig, load_preset
 from mmgsd.experiments import (
@@ -46,6 +44,7 @@ from mmgsd.measure.evaluation import (
 )
 from mmgsd.parameters import read_scheduler
 from mmgsd.paths import Paths, find_root
+from mmgsd.progress import ProgressBar
 
 TABLES = ("budget", "robustness", "backbones")  # studies with a file of their own, of models under their rows' names
 VALIDATIONS = 8  # RMSE on held-out simulations, in a model's log
@@ -112,12 +111,12 @@ def run_tasks(tasks: list[Task], preset: Preset, root: Path, *, scheduler: str =
     if not scheduler:
         yield from (run_task(task, preset, root, progress=True) for task in tasks)
         return
-    with Client(scheduler) as client:
+    with open_client(scheduler) as client:
         futures = {}
         for i, task in enumerate(tasks):
             after = next((futures.get(start.name) for start in reversed(_find_start(task, preset))), None)
             futures[name_task(task)] = client.submit(run_task, task, preset, root, after, pure=False, priority=-i)
-        yield from (future.result() for future in as_completed(futures.values()))
+        yield from (future.result() for future in wait_for_each(client, futures.values()))
 
 
 def write_tables(preset: Preset, root: Path) -> None:
@@ -244,8 +243,8 @@ def main() -> None:
         parser.error(f"--only {args.only!r}: no model or baseline of the preset {preset.name} has a name with that")
     scheduler = read_scheduler("--scheduler", args.scheduler)
     done = run_tasks(tasks, preset, find_root(), scheduler=scheduler)
-    for name, rmse in tqdm(done, total=len(tasks), desc="models and baselines"):
-        tqdm.write(f"{name}: {rmse:.1f} px")
+    for name, rmse in ProgressBar(done, total=len(tasks), desc="models and baselines"):
+        ProgressBar.write(f"{name}: {rmse:.1f} px")
         if args.seeds:
             write_seed_table(preset, find_root(), args.seeds, steps=args.steps)
         elif args.steps:

@@ -32,7 +32,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from tqdm.auto import tqdm
 
 from mmgsd.dataset import load_dataset
 from mmgsd.files import DamagedFileError, read_json, write_json, write_text
@@ -40,6 +39,7 @@ from mmgsd.images import check_pixels, find_beside, read_image
 from mmgsd.match.match import Match
 from mmgsd.match.matcher import Matcher, find_weights
 from mmgsd.paths import find_root
+from mmgsd.progress import ProgressBar
 
 SOURCES = 4  # photographs whose places are asked for
 INDEX = "index.json"  # of a folder of photographs
@@ -175,7 +175,8 @@ def ask_photographs(
     def ask() -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """Both images and the pixels of each pair; a target is read once."""
         last, image = None, None
-        for (source, image0), target in tqdm(pairs, desc="measure", unit="pair", disable=not progress, leave=False):
+        bar = ProgressBar(pairs, desc="measure", unit="pair", disable=not progress, leave=False)
+        for (source, image0), target in bar:
             last, image = (last, image) if target is last else (target, target.read())
             yield image0, image, source.xy
 

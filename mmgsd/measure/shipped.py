@@ -196,7 +196,12 @@ def measure_baseline(
 
 
 def measure_study(
-    study: str, root: Path, preset: Preset, *, objects: Sequence[str] = (), steps: int = 0,
+    study: str,
+    root: Path,
+    preset: Preset,
+    *,
+    objects: Sequence[str] = (),
+    steps: int = 0,
     photographs: Path | None = None,
 ) -> dict[str, dict[str, Any]]:
     """The rows of a study's models, those of some ``objects`` where they are named.

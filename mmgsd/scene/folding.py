@@ -14,9 +14,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from dask.distributed import Client, as_completed
+from dask.distributed import Client
 
 from mmgsd.checks import check, check_choice, read_count, read_flag
+from mmgsd.cluster import wait_for_each
 from mmgsd.files import DamagedFileError, scratch_folder, set_aside, write_bytes
 from mmgsd.fold.tasks import GROUNDS, STARTS, Move, Task, find_task, place_truth
 from mmgsd.progress import ProgressBar
@@ -135,7 +136,7 @@ def _run_missing(client: Client, jobs: dict[str, dict], files: dict[str, Path], 
                for batch in batches]  # fmt: skip
     try:
         with ProgressBar(total=len(names), desc="fold", unit="state", disable=not progress) as bar:
-            for future in as_completed(futures):
+            for future in wait_for_each(client, futures):
                 made = future.result()
                 for name, data in made.items():
                     write_bytes(files[name], data)

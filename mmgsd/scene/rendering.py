@@ -23,10 +23,11 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from dask.distributed import Client, LocalCluster, as_completed
+from dask.distributed import Client, LocalCluster
 from dask.system import cpu_count
 
 from mmgsd.checks import read_count, read_flag
+from mmgsd.cluster import open_client, wait_for_each
 from mmgsd.config import DEFAULT_GROUP, OBJECTS, OWN_GROUP, RenderConfig, list_later, to_dict
 from mmgsd.dataset import load_dataset
 from mmgsd.dataset_format import FORMAT, SPLITS, encode_table, find_owner, is_member
@@ -57,6 +58,14 @@ BATCH = re.compile(r"(train|test)_\d+\.(zip|tmp)(\.damaged)?|config\.(json|tmp)(
 LABELS = {"episode", "view", "split", "xy", "visible", "intrinsics", "camera_pose", "info"}  # of a view in a batch
 UNREADABLE = (OSError, EOFError, ValueError, TypeError, LookupError, AttributeError, NotImplementedError, RuntimeError,
               zipfile.BadZipFile, zlib.error)  # fmt: skip  # what zipfile raises about a damaged archive
+# Our package is found where this one was; what else lies there or in the working directory, a bpy.py say, is not.
+CHILD = """
+import runpy, sys
+sys.path.insert(0, sys.argv[2])
+import mmgsd
+del sys.path[0]
+runpy.run_module(sys.argv[1], run_name="__main__")
+"""
 
 _children: set[subprocess.Popen] = set()  # that render for this process now
 
@@ -165,14 +174,15 @@ def render_batch(job: dict) -> bytes:
 
 def run_child(job: dict, folder: Path) -> tuple[int, str]:
     """Exit code and stderr of a child that renders ``job``, with ``folder`` for all its temporary files."""
-    path = os.pathsep.join([str(Path(__file__).resolve().parents[2]), os.environ.get("PYTHONPATH", "")])
+    place = str(Path(__file__).resolve().parents[2])
+    path = os.pathsep.join(filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep)))  # an empty one is the cwd
     # as many children as cores, so one thread in each
     one = {"MMGSD_THREADS": "1", "OMP_NUM_THREADS": "1", "OIDN_NUM_THREADS": "1", "OIDN_SET_AFFINITY": "0"}
-    env = {**one, **os.environ, "PYTHONPATH": path, "TMPDIR": str(folder)}
+    env = {**one, **os.environ, "PYTHONSAFEPATH": "1", "PYTHONPATH": path, "TMPDIR": str(folder)}
     pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
     # a session of its own: Ctrl-C stops the parent, which ends its children, and none of them fails and is tried again
     with subprocess.Popen(
-        [sys.executable, "-m", "mmgsd.scene"], env=env, text=True, start_new_session=True, **pipes
+        [sys.executable, "-c", CHILD, "mmgsd.scene", place], env=env, text=True, start_new_session=True, **pipes
     ) as child:
         _children.add(child)
         try:
@@ -199,7 +209,7 @@ def connect(workers: int, scheduler: str) -> Iterator[Client]:
     0 workers: as many as this process may use cores. At the end the children of this process are ended.
     """
     if scheduler:
-        with Client(scheduler) as client:
+        with open_client(scheduler) as client:
             yield client
         return
     threads = workers or cpu_count()  # they only wait for the children; affinity and quotas count
@@ -243,7 +253,7 @@ def _render_batches(client: Client, jobs: dict, partial: Path, config: RenderCon
     total = sum(n for job in jobs.values() for _, n in job["episodes"])
     try:
         with ProgressBar(total=total, desc=f"render {config.object}", unit="image", disable=not progress) as bar:
-            for future in as_completed(list(futures)):
+            for future in wait_for_each(client, list(futures)):
                 name = futures.pop(future)
                 write_bytes(partial / f"{name}.zip", future.result())
                 bar.update(sum(n for _, n in jobs[name]["episodes"]))

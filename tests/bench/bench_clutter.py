@@ -11,10 +11,12 @@ import statistics
 import torch
 from bench_learning import measure_pace
 
+from mmgsd.command import run_command
 from mmgsd.config import OBJECTS, load_preset
 from mmgsd.experiments import configure_model
 from mmgsd.files import write_json
 from mmgsd.learn.training import name_hardware
+from mmgsd.parameters import check_images
 from mmgsd.paths import Paths, find_root
 
 ROUNDS = 2
@@ -23,6 +25,7 @@ ROUNDS = 2
 def main() -> None:
     """Measure both objects, print and store."""
     results, root = {}, find_root()
+    check_images(Paths(root, "smoke"), OBJECTS, split="train")
     for name in OBJECTS:
         config = dataclasses.replace(configure_model(load_preset("paper"), name, "shipped"), also="")
         seconds = {True: [], False: []}
@@ -37,4 +40,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

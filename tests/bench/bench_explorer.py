@@ -10,8 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
+from mmgsd.command import run_command
+
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from browser import click_figure, open_explorer, run_lab
+from browser import CHROMIUM, click_figure, open_explorer, run_lab
 
 WATCH = """() => {
     const canvas = document.querySelectorAll('.mmgsd-picture canvas')[1];
@@ -27,6 +29,8 @@ WATCH = """() => {
 
 def main() -> None:
     """Print the median milliseconds, and the slowest tenth's."""
+    if CHROMIUM is None:
+        raise RuntimeError("the program chromium is not installed: the page is shown in it")
     clicks, rng, took = int(sys.argv[1]) if len(sys.argv) > 1 else 30, np.random.default_rng(0), []
     with tempfile.TemporaryDirectory() as folder, run_lab(Path(folder)) as address, open_explorer(address) as page:
         for x, y in rng.uniform((0.24, 0.3), (0.76, 0.7), (clicks + 3, 2)):
@@ -40,4 +44,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -20,6 +20,7 @@ from pathlib import Path
 
 import pandas as pd
 
+from mmgsd.command import run_command
 from mmgsd.config import METHODS, OBJECTS, TrainConfig, load_preset
 from mmgsd.dataset import hold_out, load_dataset
 from mmgsd.experiments import configure_model
@@ -27,6 +28,7 @@ from mmgsd.learn.checkpoints import LOG, load_metadata
 from mmgsd.learn.training import train_model
 from mmgsd.match.matcher import Matcher
 from mmgsd.measure.questions import measure_rmse
+from mmgsd.parameters import check_images
 from mmgsd.paths import Paths, find_root
 
 PACE_STEPS = 20  # steps that the pace is measured on, after as many to warm up
@@ -86,6 +88,7 @@ def main() -> None:
     paths = Paths(find_root(), args.preset)
     config = configure_model(load_preset(args.preset), args.object, args.method)
     config, dataset = dataclasses.replace(config, **parse_changes(args.changes)), paths.dataset(args.object)
+    check_images(paths, [args.object], split="train")
     held_out = hold_out(load_dataset(dataset, "train"))[1]
     commit = subprocess.run(["git", "describe", "--always", "--dirty"], capture_output=True, text=True).stdout.strip()
     results = []
@@ -108,4 +111,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

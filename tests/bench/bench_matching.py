@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from sklearn.mixture import GaussianMixture
 
+from mmgsd.command import run_command
 from mmgsd.config import ROUNDNESS, load_preset
 from mmgsd.dataset import load_dataset, sample_pairs
 from mmgsd.learn.checkpoints import WEIGHTS
@@ -27,6 +28,7 @@ from mmgsd.learn.network import compute_cell_centres
 from mmgsd.match.matcher import Matcher, read_heatmap
 from mmgsd.match.mixture import PRIOR_WEIGHT
 from mmgsd.measure.metrics import compute_mode_errors
+from mmgsd.parameters import check_images, check_made
 from mmgsd.paths import Paths, find_root
 
 MODES, PLAIN, AGREE_PX = 4, 100, 0.25  # modes; queries asked the plain way
@@ -112,7 +114,7 @@ def fit_all_pixels(pixels, means):
 def measure_argmin(data, descriptors, dim, queries):
     """Queries a second of a search over all pixels for the nearest descriptor of ``dim`` numbers."""
     _, second, _ = queries[0]
-    grid = descriptors[second][-dim:].permute(1, 2, 0).numpy()
+    grid = descriptors[second].descriptors[-dim:].permute(1, 2, 0).numpy()
     full = np.stack([cv2.resize(grid[..., k], data.size) for k in range(grid.shape[-1])], -1)  # (H, W, D)
     start = time.perf_counter()
     for first, _, point in queries:
@@ -136,10 +138,10 @@ def main():
     """Print what was measured, then the line that is compared."""
     pairs, preset = (int(sys.argv[1]) if len(sys.argv) > 1 else 40), (sys.argv[2:] or ["quick"])[0]
     paths, config = Paths(find_root(), preset), load_preset(preset).train["cloth"]
-    data = load_dataset(paths.dataset("cloth"), "test")
-    matcher = Matcher.load(paths.model(config) / WEIGHTS)
-    if str(matcher.device) != "cpu":
-        raise SystemExit("the comparison is made on a CPU: set CUDA_VISIBLE_DEVICES=''")
+    weights = paths.model(config) / WEIGHTS
+    check_images(paths, ["cloth"])
+    check_made(paths, "03_train with run=True", [weights])
+    data, matcher = load_dataset(paths.dataset("cloth"), "test"), Matcher.load(weights, device="cpu")
     chosen = [tuple(pair) for pair in sample_pairs(data.episode, pairs, np.random.default_rng(0)).tolist()]
     queries = draw_queries(data, chosen)
     measure_ours(matcher, data, chosen[:2])  # warms up
@@ -168,4 +170,4 @@ def main():
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

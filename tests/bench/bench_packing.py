@@ -10,11 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
+from mmgsd.command import run_command
 from mmgsd.config import OBJECTS, EvaluateConfig, load_preset
 from mmgsd.experiments import configure_model
 from mmgsd.extras.packing import unpack_dataset
 from mmgsd.learn.checkpoints import WEIGHTS
 from mmgsd.measure.evaluation import evaluate_model, load_queries
+from mmgsd.parameters import check_images, check_made
 from mmgsd.paths import Paths, find_root
 
 QUESTIONS = EvaluateConfig(pairs=100, points=125)
@@ -24,9 +26,12 @@ def main() -> None:
     """Print both errors of each object, and how far single queries differ."""
     preset, models = (sys.argv[1:] + ["paper", "quick"][len(sys.argv) - 1 :])[:2]
     paths, trained = Paths(find_root(), preset), Paths(find_root(), models)
+    check_images(paths, OBJECTS)
     for name in OBJECTS:
         archive = paths.root / "data" / "packs" / f"{preset}-{name}.zip"
         weights = trained.model(configure_model(load_preset(models), name, "mmgsd")) / WEIGHTS
+        check_made(paths, "make data-pack", [archive])
+        check_made(trained, "03_train with run=True", [weights])
         errors = []
         with tempfile.TemporaryDirectory() as folder:
             for data in (paths.dataset(name), unpack_dataset(archive, Path(folder) / name)):
@@ -41,4 +46,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -148,6 +148,18 @@ def test_a_failing_child_says_why() -> None:
         render_batch({**job, "split": "validation"})
 
 
+def test_modules_of_the_working_directory_are_not_taken_for_blenders(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("bpy", "json", "runpy", "mmgsd"):
+        (tmp_path / f"{name}.py").write_text("raise SystemExit('not mine')")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep)  # twice the working directory
+    job = {"config": {"samples": 0}, "split": "test", "episodes": [], "out": "a.zip"}
+    code, said = rendering.run_child(job, tmp_path)
+    assert code == 1 and "samples must be" in said
+
+
 def test_images_of_an_older_kind_of_cloth_are_not_taken_for_todays(tiny_dataset: Callable[..., Path]) -> None:
     config, folder = RenderConfig(object="cloth"), tiny_dataset(object="cloth")
     info = json.loads((folder / "dataset.json").read_text()) | {"config": dataclasses.asdict(config)}

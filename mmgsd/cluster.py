@@ -1,0 +1,58 @@
+"""A Dask cluster of others': its address leads to a scheduler, which has workers, or a user is told what is missing."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import sys
+import time
+from collections.abc import Collection, Iterator
+from concurrent.futures import CancelledError, ThreadPoolExecutor
+
+from dask.distributed import Client, Future, Security, wait
+from distributed.comm import connect
+from tqdm.auto import tqdm
+
+PATIENCE = 30.0  # s that a scheduler has to answer, and to have a worker before it is said that there is none
+LOOK = 1.0  # s between two looks at the workers
+
+
+def open_client(scheduler: str) -> Client:
+    """A client of the scheduler at an address; ValueError where nothing answers there as Dask does."""
+    try:
+        with ThreadPoolExecutor(1) as thread:  # in this one a notebook's own loop runs
+            thread.submit(asyncio.run, asyncio.wait_for(_greet(scheduler), PATIENCE)).result()
+        return Client(scheduler, timeout=PATIENCE)
+    except Exception as error:  # whatever it is that another program's answer does to Dask's reader
+        raise ValueError(
+            f"scheduler must be the address of a Dask scheduler, got {scheduler!r}, where none answers: "
+            "take the one that `dask scheduler` prints when it starts"
+        ) from error
+
+
+async def _greet(scheduler: str) -> None:
+    """A client would wait for ever where somebody listens and says nothing."""
+    comm = await connect(scheduler, timeout=PATIENCE, **Security().get_connection_args("client"))
+    comm.abort()
+
+
+def wait_for_each(client: Client, futures: Collection[Future]) -> Iterator[Future]:
+    """The futures as they are done; where the cluster has no worker it says so, and goes on as soon as one joins.
+
+    RuntimeError where the scheduler itself is lost.
+    """
+    pending, seen, address = set(futures), time.monotonic(), client.scheduler.address
+    while pending:
+        done: Collection[Future] = ()
+        try:
+            with contextlib.suppress(TimeoutError):
+                done, pending = wait(pending, LOOK, "FIRST_COMPLETED")
+            if done or client.nthreads():
+                seen = time.monotonic()
+        except (CancelledError, OSError) as error:
+            raise RuntimeError(f"the Dask scheduler {address} was lost: start it and its workers again") from error
+        if time.monotonic() - seen > PATIENCE:
+            seen = float("inf")  # said once, until there is a worker again
+            tqdm.write(f"the Dask scheduler {address} has no workers, and nothing is done until one joins: "
+                       f"`dask worker {address}` starts one", file=sys.stderr)  # fmt: skip
+        yield from done
