@@ -76,9 +76,7 @@ def test_every_bench_is_run() -> None:
     ("clutter", "smoke/cloth/dataset.json"), ("learning", "paper/cloth/dataset.json"),
     ("matching", "quick/cloth/dataset.json"), ("packing", "paper/cloth/dataset.json"),
 ])  # fmt: skip
-def test_a_bench_says_which_data_it_lacks(
-    run: Callable, tmp_path: Path, name: str, missing: str
-) -> None:
+def test_a_bench_says_which_data_it_lacks(run: Callable, tmp_path: Path, name: str, missing: str) -> None:
     with pytest.raises(ValueError, match=f"there is no data/generated/{missing} yet: run 01_render_data"):
         run(name, tmp_path)
 
