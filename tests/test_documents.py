@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import argparse
 import importlib.util
 import re
+import shlex
 import subprocess
+import sys
 from pathlib import Path
 
 import nbformat
 import numpy as np
 import pandas as pd
 import pytest
+import tomllib
 
 from mmgsd.dataset import load_dataset
 from mmgsd.report.findings import FINDINGS, SECTIONS
@@ -19,7 +23,16 @@ from mmgsd.report.tables import update_tables
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "data/results/README.md",
                                       "data/results/LOG.md")] + sorted((ROOT / "docs").glob("*.md"))  # fmt: skip
+PRESENT = [path for path in DOCUMENTS if path.name not in ("CHANGELOG.md", "LOG.md")]  # these tell of the past
 FILLED = [path for path in DOCUMENTS if "made by `make readme`" in path.read_text("utf-8")]
+# What the lines of shell in the documents begin with, and what tries them.
+TRIED = {
+    "make": "test_commands_name_modules_notebooks_and_targets_that_exist, test_makefile.py",
+    "papermill": "test_notebooks_have_the_parameters_that_commands_give_them, test_run_all.py",
+    "mmgsd": "test_commands_are_parsed",
+    "pytest": "this", "ruff": "make lint", "pip": "test_wheel.py, test_extras_exist",
+    "git": "needs a network", "cd": "a folder of the reader's",
+}  # fmt: skip
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 
 
@@ -69,6 +82,80 @@ def test_notebooks_have_the_parameters_that_commands_give_them(path: Path) -> No
         for name in re.findall(r"-p (\w+) ", options):
             assert re.search(rf"^{name} = ", parameters, re.MULTILINE), (notebook, name)
         assert "-p run True" in options or "\nrun = " not in parameters, (notebook, "computes nothing")
+
+
+def list_lines(path: Path) -> list[str]:
+    """The lines of a document's blocks of shell."""
+    blocks = re.findall(r"^```(?:sh|bash|shell|console)\n(.*?)^```", path.read_text("utf-8"), re.DOTALL | re.MULTILINE)
+    return [line for block in blocks for line in block.replace("\\\n", " ").splitlines() if line.strip()]
+
+
+def split_command(line: str) -> tuple[str, list[str]]:
+    """What a line of shell starts, "mmgsd.measure.matrix" say, and its arguments, braces expanded."""
+    words = []
+    for word in shlex.split(line, comments=True):
+        before, braced, after = re.fullmatch(r"(.*?)(?:\{(.*?)\})?([^{}]*)", word).groups()
+        words += [word] if braced is None else [f"{before}{choice}{after}" for choice in braced.split(",")]
+    if Path(words[0]).name.startswith("python") and words[1] == "-m":
+        return words[2], words[3:]
+    return Path(words[0]).name, words[1:]
+
+
+def list_commands(path: Path) -> list[tuple[str, list[str]]]:
+    """Commands of ours in a document's blocks of shell, and with all their arguments in its sentences."""
+    text = path.read_text("utf-8")
+    sentences = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
+    pattern = r"`([^`\s]*python -m mmgsd\.[\w.]+ [^`\n]+|(?:[^`\s]*python -m )?mmgsd \w+ [^`\n]+)`"
+    inline = re.findall(pattern, sentences)
+    split = [split_command(line) for line in [*list_lines(path), *inline] if "…" not in line and "COMMAND" not in line]
+    return [(module, words) for module, words in split if module.partition(".")[0] == "mmgsd"]
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_no_line_of_shell_is_tried_by_no_test(path: Path) -> None:
+    for line in list_lines(path):
+        assert split_command(line)[0].partition(".")[0] in TRIED, line
+
+
+class Parsed(Exception):
+    """A command's arguments were taken."""
+
+
+@pytest.mark.parametrize("path", PRESENT, ids=lambda path: str(path.relative_to(ROOT)))
+def test_commands_are_parsed(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    parse = argparse.ArgumentParser.parse_args
+
+    def parse_only(self: argparse.ArgumentParser, *args: object, **kwargs: object) -> None:
+        parse(self, *args, **kwargs)
+        raise Parsed
+
+    monkeypatch.setattr(argparse.ArgumentParser, "parse_args", parse_only)
+    for module, words in list_commands(path):
+        monkeypatch.setattr(sys, "argv", [module, *words])
+        name = f"{module}.__main__" if importlib.util.find_spec(module).submodule_search_locations else module
+        with pytest.raises(Parsed):
+            importlib.import_module(name).main()
+
+
+def test_extras_exist() -> None:
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["optional-dependencies"]
+    named = re.findall(r"(?:mmgsd|[`'\"]\.)\[([a-z,]+)\]", "".join(path.read_text("utf-8") for path in DOCUMENTS))
+    assert named and {extra for names in named for extra in names.split(",")} <= extras.keys()
+
+
+def test_the_lines_of_python_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(ROOT)
+    rendered = []
+    monkeypatch.setattr("mmgsd.scene.rendering.render_dataset", lambda config, *args, **how: rendered.append(config))
+    names: dict[str, object] = {}
+    for name in ("README.md", "docs/your-photographs.md"):
+        text = (ROOT / name).read_text("utf-8")
+        for block in re.findall(r"^```python\n(.*?)^```", text, re.DOTALL | re.MULTILINE):
+            exec(block, names)
+            if "images" in names:
+                names |= {"image0": names["images"][0], "image1": names["images"][1]}
+                names["mask1"] = names["image1"].any(-1)
+    assert names["match"].joint is not None and len(rendered) == 2
 
 
 @pytest.mark.parametrize(("name", "words"), [("README.md", 1000), ("data/results/README.md", 1500)])
