@@ -274,7 +274,7 @@ class Pair:
         count = check_answers(self.matcher.modes if n is None else n, self.matcher.modes)
         mask = self._find_mask()
         places = spread_places(mask)
-        match = self._match(np.concatenate([points, places.astype(points.dtype)]), None)
+        match = self._match(np.concatenate([points, places.astype(points.dtype)]), None, merge=False)
         order = join(match.xy, mask, match.modes, match.weights, match.spread_px, places=len(places))
         weights = np.take_along_axis(match.weights, order, 1)
         heavy = weights[len(points) if len(places) else 0 :].sum(0) + 1e-9
@@ -289,7 +289,7 @@ class Pair:
                              f"{self.matcher.config.name} learnt no mask")  # fmt: skip
         return self.matcher.resize_mask(self.said[0].mask, self.image0.shape[1::-1]) >= 0.5
 
-    def _match(self, points: np.ndarray, n: Any) -> Match:
+    def _match(self, points: np.ndarray, n: Any, *, merge: bool = True) -> Match:
         size0, size1 = sizes = tuple((im.shape[1], im.shape[0]) for im in (self.image0, self.image1))
         mask1 = None if self.mask1 is None else torch.from_numpy(self.mask1)
         cells = self.matcher.compute_heatmaps(*self.said, torch.from_numpy(points), size0, mask1=mask1)
@@ -297,7 +297,7 @@ class Pair:
         fitted, reading = self.matcher.modes, self.matcher.reading
         scale = compute_scale(size1, self.matcher.size)
         match = make_match(self.image0, self.image1, points, cells, centres, n, fitted=fitted, reading=reading,
-                           scale=scale)  # fmt: skip
+                           scale=scale, merge=merge)  # fmt: skip
         return dataclasses.replace(match, calibration=self.matcher.calibration, **self._look(match, sizes))
 
     def _look(self, match: Match, sizes: tuple[tuple[int, int], ...]) -> dict[str, np.ndarray]:
@@ -336,16 +336,17 @@ def find_weights(weights: Path | str) -> Path:
 
 def make_match(
     image0: np.ndarray, image1: np.ndarray, xy: np.ndarray, cells: Tensor, centres: tuple[Tensor, Tensor], n: Any, *,
-    fitted: int = 1, reading: Reading = AS_IT_IS, scale: float = 1.0,
+    fitted: int = 1, reading: Reading = AS_IT_IS, scale: float = 1.0, merge: bool = True,
 ) -> Match:  # fmt: skip
     """The answer that heatmaps (S, h, w) with cell ``centres`` (w,), (h,) px hold, however they were made.
 
-    At least ``fitted`` modes are fitted, of which the ``n`` most probable are returned; None: as many. ``scale`` is
+    At least ``fitted`` modes are fitted, of which the ``n`` most probable are returned; None: as many. Unless ``merge``
+    is false, those on one spot are one (`fit_modes`). ``scale`` is
     `compute_scale`'s, for an entropy that does not depend on the number of image1's pixels.
     """
     wanted = check_count(fitted if n is None else n, "n", queries=len(cells))
     fit, entropy = read_heatmap(cells, "auto" if wanted is None else wanted.clamp(min=fitted), centres,
-                                reading=reading)  # fmt: skip
+                                reading=reading, merge=merge)  # fmt: skip
     fit = fit if wanted is None else keep_most_probable(fit, wanted)
     arrays = (t.cpu().numpy() for t in (fit.modes, fit.weights, fit.covariances, entropy, fit.outside, cells))
     match = Match(image0, image1, xy, *arrays, scale=scale)
@@ -369,12 +370,13 @@ def compute_scale(size: tuple[int, int], trained: tuple[int, int]) -> float:
 
 
 def read_heatmap(
-    heatmap: Tensor, n: int | str | Tensor, centres: tuple[Tensor, Tensor], *, reading: Reading = AS_IT_IS
-) -> tuple[Mixture, Tensor]:
+    heatmap: Tensor, n: int | str | Tensor, centres: tuple[Tensor, Tensor], *, reading: Reading = AS_IT_IS,
+    merge: bool = False,
+) -> tuple[Mixture, Tensor]:  # fmt: skip
     """Mixtures of ``n`` modes and entropies (S,) in nats of heatmaps (S, h, w) with cell ``centres`` (w,), (h,) px."""
     xs, ys = (c.float().to(heatmap.device) for c in centres)
     entropy = compute_entropy(heatmap.flatten(1), float((xs[1] - xs[0]) * (ys[1] - ys[0])))
-    return fit_modes(heatmap, n, xs, ys, reading=reading), entropy
+    return fit_modes(heatmap, n, xs, ys, reading=reading, merge=merge), entropy
 
 
 def _check_size(size: tuple[int, int]) -> None:
