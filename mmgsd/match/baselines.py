@@ -27,6 +27,7 @@ from mmgsd.match.features import Extractor, extract_imagenet, sample_features
 from mmgsd.match.match import Match
 from mmgsd.match.matcher import make_match
 from mmgsd.match.mixture import check_modes
+from mmgsd.numerics import own_numerics
 
 BASELINES = ("sift", "orb", "akaze", "daisy", "imagenet")
 BINARY = ("orb", "akaze")  # compared by Hamming distance
@@ -78,6 +79,7 @@ class FeatureMatcher:
         heatmap, grid = compute_described_heatmap(image0, image1, xy, mask1, describe=self.describe)
         return torch.from_numpy(heatmap), (torch.from_numpy(grid[0, :, 0]), torch.from_numpy(grid[:, 0, 1]))
 
+    @own_numerics()
     def match(
         self, image0: np.ndarray, image1: np.ndarray, xy: Any, *, n: Any = None,
         mask1: np.ndarray | None = None,

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from mmgsd.learn.network import IMAGENET_MEAN, IMAGENET_STD, build_trunk, compute_taps, sample_descriptors
+from mmgsd.numerics import own_numerics
 
 Extractor = Callable[[np.ndarray], Any]  # (H, W, 3) uint8 -> (D, h, w)
 LONGEST_PX, MULTIPLE_PX = 640, 32  # of what EfficientNet-Lite0 is given: about the sizes it was made for, and up
@@ -35,13 +36,13 @@ def sample_features(features: Any, xy: np.ndarray, size: tuple[int, int]) -> np.
     return F.normalize(sample_descriptors(values[None], places, size)[0], dim=-1).numpy()
 
 
-@torch.inference_mode()
+@own_numerics()
 def extract_imagenet(image: np.ndarray) -> Tensor:
     """Features (D, h, w) of EfficientNet-Lite0 as ImageNet taught it, of an image (H, W, 3) uint8."""
     scale = min(1, LONGEST_PX / max(image.shape[:2]))
     size = [max(1, round(side * scale / MULTIPLE_PX)) * MULTIPLE_PX for side in image.shape[1::-1]]
     x = torch.from_numpy(cv2.resize(image, size, interpolation=cv2.INTER_AREA)).permute(2, 0, 1)[None].float() / 255
-    x = (x - torch.tensor(IMAGENET_MEAN).view(3, 1, 1)) / torch.tensor(IMAGENET_STD).view(3, 1, 1)
+    x = (x - x.new_tensor(IMAGENET_MEAN).view(3, 1, 1)) / x.new_tensor(IMAGENET_STD).view(3, 1, 1)
     return compute_taps(_load_trunk(), x)[TAP][0]
 
 

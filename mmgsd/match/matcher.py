@@ -27,6 +27,7 @@ from mmgsd.match.joint import join, spread_places
 from mmgsd.match.match import Match, sort_modes
 from mmgsd.match.mixture import AS_IT_IS, Mixture, Reading, check_count, check_modes, fit_modes, keep_most_probable
 from mmgsd.match.weights import read_weights
+from mmgsd.numerics import own_numerics
 from mmgsd.paths import find_shipped
 
 QUARTERS = 4  # turns of an image whose descriptors are averaged: what noise they have differs
@@ -73,7 +74,7 @@ class Matcher:
         check_scales(bandwidth=bandwidth, temperature=temperature)
         check_modes(modes)
         _check_size(size)
-        self.device = torch.device(device or find_device())
+        self.device = torch.device(find_device(device))
         self.network = network.eval().to(self.device, memory_format=torch.channels_last)
         self.config, self.modes, self.size = config, modes, size
         self.object = config.object  # "" where a file of weights does not say
@@ -83,6 +84,7 @@ class Matcher:
         self.bandwidth = config.margin / 4 if bandwidth is None and config.method in CONTRASTIVE else bandwidth
 
     @classmethod
+    @own_numerics(gradients=True)
     def load(cls, path: Path | str, *, device: str = "") -> Matcher:
         """Weights from a safetensors file; FileNotFoundError, or ValueError for one that is damaged or not ours."""
         weights = read_weights(path)
@@ -93,7 +95,7 @@ class Matcher:
         matcher.object = weights.object
         return matcher
 
-    @torch.inference_mode()
+    @own_numerics()
     def describe(self, images: list[np.ndarray]) -> list[Outputs]:
         """What the network says of each of the images (H, W, 3) uint8 of any sizes, the mean over quarter turns.
 
@@ -115,9 +117,15 @@ class Matcher:
         size = (image.shape[1], image.shape[0])
         if size[0] * self.size[1] != size[1] * self.size[0]:  # what the model was taught with may be a strip
             check_aspect(size, name)
-        # px: where a level is less than 3 cells across, bfloat16's strided convolution on a CPU reads memory at random
-        least = 12 * self.network.stride
-        return fit_input_size(size, self.size, self.config.input_px, least_px=least)
+        return fit_input_size(size, self.size, self.config.input_px, least_px=self.least_px)
+
+    @property
+    def least_px(self) -> int:
+        """Of the shorter side of what the network is given.
+
+        Where a level is less than 3 cells across, bfloat16's strided convolution on a CPU reads memory at random.
+        """
+        return 12 * self.network.stride
 
     def describe_inputs(self, batch: Tensor) -> Tensor:
         """Descriptors (B, C, h, w) of images (B, 3, H, W) in [0, 1] of the network's input size."""
@@ -129,7 +137,7 @@ class Matcher:
         said = [self.network.describe(turned).turn(-k) for k, turned in enumerate(turns)]
         return Outputs.mean(said)
 
-    @torch.inference_mode()
+    @own_numerics()
     def compute_heatmaps(
         self, said0: Outputs, said1: Outputs, xy: Tensor, size: tuple[int, int], *, mask1: Tensor | None = None
     ) -> Tensor:
@@ -150,7 +158,7 @@ class Matcher:
         total = weighted.sum((1, 2), keepdim=True)
         return torch.where(total > 1e-12, weighted / total.clamp(min=1e-12), heatmap)
 
-    @torch.inference_mode()
+    @own_numerics()
     def compute_visible(
         self, said0: Outputs, said1: Outputs, xy: Tensor, modes: Tensor, sizes: tuple[tuple[int, int], ...]
     ) -> Tensor | None:
@@ -265,7 +273,7 @@ class Pair:
     mask0: np.ndarray | None = None  # (H0, W0) bool, of the caller's
     mask1: np.ndarray | None = None  # (H1, W1) bool
 
-    @torch.inference_mode()
+    @own_numerics()
     def match(self, xy: Any, *, n: Any = None, joint: bool = False) -> Match:
         """As `Matcher.match`."""
         points = check_pixels(xy, self.image0.shape[1::-1])

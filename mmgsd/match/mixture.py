@@ -23,6 +23,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from mmgsd.config import MAX_MODES, ROUNDNESS
+from mmgsd.numerics import own_numerics
 
 ANNEALING, ANNEALING_CYCLES = (4.0, 2.0), 6  # temperatures of the flattened heatmaps fitted first, on half the grid
 CYCLES = 60  # of three EM steps and a leap, at most; a query at rest is left alone
@@ -73,6 +74,7 @@ class Mixture:
     outside: Tensor  # (S,) mass of the heatmap outside every mode's 95 % ellipse
 
 
+@own_numerics()
 def fit_modes(
     heatmap: Tensor,
     n: int | str | Tensor,
@@ -222,7 +224,7 @@ def _interpolate(mass: Tensor, grid: tuple[int, int]) -> Tensor:
     """(S, C) mass whose moments are those of the heatmap at full resolution."""
     matrices = []
     for count in grid:
-        matrix = sum(share * torch.eye(count + 2)[k : k + count] for k, share in enumerate(SPREAD))
+        matrix = sum(share * torch.eye(count + 2, dtype=torch.float32)[k : k + count] for k, share in enumerate(SPREAD))
         matrix[:, 1] += matrix[:, 0]  # none leaves the image
         matrix[:, -2] += matrix[:, -1]
         matrices.append(matrix[:, 1:-1].to(mass.device))
@@ -240,21 +242,21 @@ def _start(mass: Tensor, n: Tensor, n_max: int, grid: tuple[int, int]) -> Tensor
         index = (local * (rest + 1e-3 * local)).flatten(1).argmax(-1)
         row, column = index // w, index % w
         rest = rest * (1 - blur_y[row][:, :, None] * blur_x[column][:, None])
-        peaks.append(torch.stack([column - (w - 1) / 2, row - (h - 1) / 2], -1))
+        peaks.append(torch.stack([column, row], -1) - mass.new_tensor([(w - 1) / 2, (h - 1) / 2]))
     present = torch.arange(n_max, device=n.device) < n[:, None]
-    variance = torch.full(present.shape, KERNEL_CELLS**2, device=n.device)
-    rest = torch.stack([present / n[:, None], variance, 0 * variance, variance], -1)
+    variance = torch.full(present.shape, KERNEL_CELLS**2, dtype=torch.float32, device=n.device)
+    rest = torch.stack([present.float() / n[:, None], variance, 0 * variance, variance], -1)
     return torch.cat([torch.stack(peaks, 1), rest], -1)
 
 
 def _make_kernel(count: int, device: torch.device) -> Tensor:
-    at = torch.arange(count, device=device)
+    at = torch.arange(count, dtype=torch.float32, device=device)
     return torch.exp(-0.5 * ((at[:, None] - at) / KERNEL_CELLS) ** 2)
 
 
 def _describe_cells(grid: tuple[int, int], device: torch.device) -> Tensor:
     """(6, C): 1, x, y, x², xy, y² of each cell, in which log-densities are linear and whose means are moments."""
-    y, x = (torch.arange(count, device=device) - (count - 1) / 2 for count in grid)
+    y, x = (torch.arange(count, dtype=torch.float32, device=device) - (count - 1) / 2 for count in grid)
     x, y = (t.flatten() for t in torch.meshgrid(x, y, indexing="xy"))
     return torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y])
 
