@@ -17,7 +17,7 @@ from mmgsd.learn.heads import Outputs
 from mmgsd.learn.network import build_network, compute_cell_centres
 from mmgsd.match import matcher as matching
 from mmgsd.match.baselines import BaselineMatcher
-from mmgsd.match.matcher import Matcher, compute_entropy, compute_heatmap, load, make_match
+from mmgsd.match.matcher import Matcher, compute_entropy, compute_heatmap, load, make_match, read_heatmap
 from mmgsd.match.mixture import Mixture, Reading
 from mmgsd.measure.metrics import compute_query_errors
 
@@ -310,8 +310,10 @@ def measure_sample(name: str, size: tuple[int, int]) -> float:
         true = data.xy[second][group.permutations[:, points].T] - corners[second]  # (S, G, 2)
         inside = ((true >= 0) & (true < size - 1)).all((1, 2)) & ((xy >= 0) & (xy < size - 1)).all(1)
         asked = inside & data.visible[first, points]
-        match = pair.match(xy[asked])
-        pair_errors.append(compute_query_errors(match.modes, match.covariances, true[asked])["rmse_px"])
+        cells = torch.from_numpy(pair.match(xy[asked]).cells)
+        fit, _ = read_heatmap(cells, len(group.permutations), compute_cell_centres(tuple(size), cells.shape[1:]))
+        modes, covariances = fit.modes.numpy(), fit.covariances.numpy()
+        pair_errors.append(compute_query_errors(modes, covariances, true[asked])["rmse_px"])
     return float(np.concatenate(pair_errors).mean())
 
 
