@@ -105,7 +105,7 @@ def train(question: Question, _: Matcher) -> list[Any]:
     return list(load_file(weights).values())
 
 
-QUICK, SLOW = (match, joint, auto, segment, baselines, calibrate), (export, train)
+QUICK, SLOW = (match, joint, auto, segment, baselines), (calibrate, export, train)
 CASES = [(name, action) for action in QUICK for name in ENVIRONMENTS]
 CASES += [("all", action) for action in SLOW] + [("threads", segment)]
 
