@@ -32,6 +32,7 @@ TRUE = "#00FF6A"  # the sign of true matches
 
 HEAT = colormaps["inferno"](np.linspace(0.3, 1, 256))[:, :3].astype(np.float32)  # from cold to hot
 FAINT = 0.35  # opacity of modes where there is no answer
+OPAQUE = 0.05  # weight from which on a mode is drawn in full; with less it fades, and with none it is not seen
 FADED = 0.75  # brightness of an image under a heatmap
 
 _SANS = ["DejaVu Sans"]  # comes with matplotlib: the same letters everywhere
@@ -86,11 +87,12 @@ def show_answer(axis: Axes, match: Match, index: int, *, modes: bool = True) -> 
 def draw_modes(axis: Axes, match: Match, index: int) -> None:
     """Rings at the modes of one query, their area the weight, and the 1-std ellipses; of hidden ones dashed.
 
-    Faint where the query has no answer (`say_presence`).
+    Faint where the query has no answer (`say_presence`), and where a mode has next to no weight.
     """
-    alpha, hidden = FAINT if say_presence(match, index) else 1.0, find_hidden(match, index)
+    opacity, hidden = FAINT if say_presence(match, index) else 1.0, find_hidden(match, index)
     for k in np.flatnonzero(np.isfinite(match.modes[index]).all(-1)):
         radii, angle = compute_ellipse(match.covariances[index, k])
+        alpha = opacity * min(1.0, match.weights[index, k] / OPAQUE)
         stroke = {"linestyle": (0, (2, 1.5)) if hidden[k] else "-", "alpha": alpha}
         x, y = match.modes[index, k]
         ellipse = Ellipse((x, y), *(2 * radii), angle=np.degrees(angle), fill=False, ec="white", lw=0.7, **stroke)

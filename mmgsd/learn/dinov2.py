@@ -15,6 +15,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from mmgsd.numerics import float32_layers
 from mmgsd.paths import find_shipped
 
 PATCH, WIDTH, DEPTH, HEADS = 14, 384, 12, 6  # px; channels; blocks; of attention
@@ -83,6 +84,7 @@ def find_backbone() -> Path:
 
 
 @functools.cache
+@float32_layers()
 def load_backbone(device: torch.device, dtype: torch.dtype = torch.float32) -> VisionTransformer:
     """The backbone on a device, its matrices in ``dtype``, once a process; ValueError for a damaged or foreign file."""
     path, network = find_backbone(), VisionTransformer(dtype)

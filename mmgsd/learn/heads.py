@@ -128,7 +128,7 @@ def compute_mask_loss(logits: Tensor, mask: Tensor) -> Tensor:
 
 def compute_present_loss(logits: Tensor, present: Tensor) -> Tensor:
     """Cross-entropy of presence logits (B,) with (B,) bool; the few images without the object count ten times."""
-    weight = torch.where(present, 1.0, 10.0)
+    weight = torch.where(present, 1.0, 10.0).to(logits.dtype)
     return F.binary_cross_entropy_with_logits(logits, present.float(), weight)
 
 

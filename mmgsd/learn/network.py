@@ -16,6 +16,7 @@ from torch.nn import functional as F
 from mmgsd.config import DETAILED, FROZEN, NETWORKS, PASSES
 from mmgsd.learn import dinov2
 from mmgsd.learn.heads import Heads, Outputs
+from mmgsd.numerics import float32_layers
 
 QUIET = 0.1  # scale of what a pass adds that is put onto trained ones: their answers hardly change at first
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
@@ -265,6 +266,7 @@ class BasicBlock(nn.Module):
         return F.relu(x + shortcut)
 
 
+@float32_layers()
 def build_network(
     name: str, descriptor_dim: int, *, roles: int = 1, heads: bool = False, pretrained: bool = True,
     trunk_weights: Path | str = "",
@@ -284,6 +286,7 @@ def build_network(
     raise ValueError(f"network must be one of {', '.join(map(repr, NETWORKS))}, got {name!r}")
 
 
+@float32_layers()
 def build_trunk(*, pretrained: bool = True) -> EfficientNet:
     """EfficientNet-Lite0 without its classifier, with ImageNet's weights or random ones."""
     trunk = EfficientNet.from_name("efficientnet-lite0")
@@ -333,7 +336,8 @@ def fit_input_size(
 def compute_cell_centres(size: tuple[int, int], shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """Full-image px of a (h, w) grid's columns (w,) and rows (h,)."""
     sx, sy = size[0] / shape[1], size[1] / shape[0]
-    return (torch.arange(shape[1]) + 0.5) * sx - 0.5, (torch.arange(shape[0]) + 0.5) * sy - 0.5
+    rows, columns = (torch.arange(count, dtype=torch.float32, device="cpu") for count in shape)
+    return (columns + 0.5) * sx - 0.5, (rows + 0.5) * sy - 0.5
 
 
 def sample_descriptors(descriptors: Tensor, xy: Tensor, size: tuple[int, int]) -> Tensor:
@@ -343,9 +347,15 @@ def sample_descriptors(descriptors: Tensor, xy: Tensor, size: tuple[int, int]) -
     return sampled[:, :, 0].mT  # (B, P, D)
 
 
-def find_device() -> str:
-    """``cuda`` where torch finds one, else ``cpu``."""
-    return "cuda" if torch.cuda.is_available() else "cpu"
+def find_device(device: str = "") -> str:
+    """The ``device``, or of "" ``cuda`` where torch finds one, else ``cpu``; ValueError for one that is not here."""
+    device = device or ("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        torch.zeros((), device=device).item()
+    except (RuntimeError, AssertionError, TypeError) as error:
+        accepted = "'cpu', or another that torch can compute on here"
+        raise ValueError(f"device must be {accepted}, got {device!r}: {str(error).splitlines()[0]}") from error
+    return device
 
 
 def _make_stage(inputs: int, outputs: int, blocks: int, *, stride: int = 1, dilation: int = 1) -> nn.Sequential:

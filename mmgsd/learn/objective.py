@@ -103,10 +103,10 @@ def _compute_judge_loss(
 
 def _draw_places(modes: Tensor, size: tuple[int, int], generator: torch.Generator) -> Tensor:
     """(B, Q, G, 2) px of matches, moved a little, and then places anywhere in the image."""
-    moved = modes + JITTER_PX * torch.randn(modes.shape, generator=generator, device=modes.device)
+    moved = modes + JITTER_PX * torch.randn(modes.shape, generator=generator, device=modes.device, dtype=modes.dtype)
     shape = (*modes.shape[:2], ELSEWHERE, 2)
-    anywhere = torch.rand(shape, generator=generator, device=modes.device) * modes.new_tensor(size) - 0.5
-    return torch.cat([moved, anywhere], 2)
+    anywhere = torch.rand(shape, generator=generator, device=modes.device, dtype=modes.dtype)
+    return torch.cat([moved, anywhere * modes.new_tensor(size) - 0.5], 2)
 
 
 def _sample_batch_pairs(images: int, pairs: int, generator: torch.Generator, device: torch.device) -> Tensor:
@@ -135,8 +135,8 @@ def _sample_non_matches(
     cell = torch.cat(drawn, -1)  # (K, Q, N)
     corner = torch.stack([cell % width, cell // width], -1)  # (K, Q, N, 2)
     cells = torch.tensor([width, height], device=cell.device)
-    pixels = torch.tensor(size, device=cell.device) / cells  # of a cell
-    within = torch.rand(corner.shape, generator=generator, device=cell.device)
+    pixels = modes.new_tensor(size) / cells  # of a cell
+    within = torch.rand(corner.shape, generator=generator, device=cell.device, dtype=modes.dtype)
     position = (corner + within) * pixels - 0.5  # (K, Q, N, 2)
     picked = sample_descriptors(target[pair[1]], position.flatten(1, 2), size).view(k, q, -1, config.descriptor_dim)
     gap = (position[:, :, :, None] - modes[:, :, None]).square().sum(-1).amin(-1)  # (K, Q, N)

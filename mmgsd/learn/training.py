@@ -43,6 +43,7 @@ from mmgsd.learn.prototypes import compute_prototype_loss, make_prototypes
 from mmgsd.match.matcher import Matcher, load
 from mmgsd.measure.calibration import calibrate_bandwidth, calibrate_modes, calibrate_temperature
 from mmgsd.measure.questions import measure_rmse
+from mmgsd.numerics import own_numerics
 from mmgsd.progress import ProgressBar
 
 PROTOTYPE_EVERY = 4  # each step asks every so many material points
@@ -58,6 +59,7 @@ def compute_learning_rate(config: TrainConfig, step: int) -> float:
     return config.learning_rate * (min(1.0, (step + 1) / warm_up) * (0.01 + 0.99 * _cosine(max(0.0, progress))))
 
 
+@own_numerics(gradients=True)
 def train_model(
     config: TrainConfig, dataset: Path, folder: Path, *,
     overwrite: bool = False, device: str = "", progress: bool = True, validate_every: int = 0,
@@ -84,7 +86,7 @@ def train_model(
     parts = load_parts(dataset, "train", also=config.also)
     if parts[0].object != config.object:
         raise ValueError(f"object is {config.object!r}, but {dataset} shows a {parts[0].object}")
-    with distributed.joined(config.groups, device or find_device()) as team, held(folder, team), (
+    with distributed.joined(config.groups, find_device(device)) as team, held(folder, team), (
         _repeatable(team.device)
     ):  # fmt: skip
         # by the process that held the folder before

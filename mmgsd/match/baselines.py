@@ -27,6 +27,7 @@ from mmgsd.match.features import Extractor, extract_dinov2, extract_imagenet, sa
 from mmgsd.match.match import Match
 from mmgsd.match.matcher import fill_question, make_match
 from mmgsd.match.mixture import check_modes
+from mmgsd.numerics import own_numerics
 
 EXTRACTORS: dict[str, Extractor] = {"imagenet": extract_imagenet, "dinov2": extract_dinov2}
 BASELINES = ("sift", "orb", "akaze", "daisy", *EXTRACTORS)
@@ -79,6 +80,7 @@ class FeatureMatcher:
         heatmap, grid = compute_described_heatmap(image0, image1, xy, mask1, describe=self.describe)
         return torch.from_numpy(heatmap), (torch.from_numpy(grid[0, :, 0]), torch.from_numpy(grid[:, 0, 1]))
 
+    @own_numerics()
     def match(
         self, image0: np.ndarray, image1: np.ndarray, xy: Any, *, n: Any = None,
         mask1: np.ndarray | None = None,

@@ -14,6 +14,7 @@ from torch.nn import functional as F
 
 from mmgsd.learn import dinov2
 from mmgsd.learn.network import IMAGENET_MEAN, IMAGENET_STD, build_trunk, compute_taps, sample_descriptors
+from mmgsd.numerics import own_numerics
 
 Extractor = Callable[[np.ndarray], Any]  # (H, W, 3) uint8 -> (D, h, w)
 LONGEST_PX = 640  # of what a network is given
@@ -37,14 +38,14 @@ def sample_features(features: Any, xy: np.ndarray, size: tuple[int, int]) -> np.
     return F.normalize(sample_descriptors(values[None], places, size)[0], dim=-1).numpy()
 
 
-@torch.inference_mode()
+@own_numerics()
 def extract_imagenet(image: np.ndarray) -> Tensor:
     """Features (D, h, w) of EfficientNet-Lite0 as ImageNet taught it, of an image (H, W, 3) uint8."""
     scale = min(1, LONGEST_PX / max(image.shape[:2]))
     return compute_taps(_load_trunk(), _normalise(image, scale, MULTIPLE_PX))[TAP][0]
 
 
-@torch.inference_mode()
+@own_numerics()
 def extract_dinov2(image: np.ndarray) -> Tensor:
     """Features (384, h, w) of DINOv2's last block for 46 patches along the longer side of an image (H, W, 3) uint8."""
     x = _normalise(image, LONGEST_PX / max(image.shape[:2]), dinov2.PATCH)
@@ -55,7 +56,7 @@ def _normalise(image: np.ndarray, scale: float, multiple: int) -> Tensor:
     """(1, 3, h, w) of an image, scaled, both sides a ``multiple`` of px, as ImageNet's networks are given images."""
     size = [max(1, round(side * scale / multiple)) * multiple for side in image.shape[1::-1]]
     x = torch.from_numpy(cv2.resize(image, size, interpolation=cv2.INTER_AREA)).permute(2, 0, 1)[None].float() / 255
-    return (x - torch.tensor(IMAGENET_MEAN).view(3, 1, 1)) / torch.tensor(IMAGENET_STD).view(3, 1, 1)
+    return (x - x.new_tensor(IMAGENET_MEAN).view(3, 1, 1)) / x.new_tensor(IMAGENET_STD).view(3, 1, 1)
 
 
 @cache

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from mmgsd.match.calibration import Calibration, Gaussian, Modes, compute_share
+from mmgsd.numerics import numpy_defaults
 
 RADIUS_PX = 20.0  # of a training image, within which a robot's grasp still holds, unless the caller says otherwise
 SHARED = (
@@ -87,6 +88,7 @@ class Match:
             full[index] = self.compute_heatmap(index)
         return full
 
+    @numpy_defaults()
     def compute_heatmap(self, index: int = 0) -> np.ndarray:
         """(H1, W1) float32, the heatmap of one query over image1's pixels; sums to 1."""
         size = (self.image1.shape[1], self.image1.shape[0])
@@ -98,6 +100,7 @@ class Match:
         """(S, n) std of each mode, root mean square over directions; NaN for absent modes."""
         return np.sqrt(np.trace(self.covariances, axis1=-2, axis2=-1) / 2)
 
+    @numpy_defaults()
     def confidence(self, *, radius_px: float | None = None) -> np.ndarray:
         """(S, n) in [0, 1], probability that a true match lies within ``radius_px`` px of image1 of each mode.
 
@@ -114,6 +117,7 @@ class Match:
         shown = shown if self.absent is None else shown * (1 - self.absent[:, None])
         return self._promise.compute_confidence(radius, self._measured) * shown
 
+    @numpy_defaults()
     def radius_px(self, *, level: float = 0.9) -> np.ndarray:
         """(S, n) px of image1: a true match lies within it of each mode with at least probability ``level``.
 
@@ -124,6 +128,7 @@ class Match:
         """
         return self.scale * self._promise.compute_radius(level, self._measured)
 
+    @numpy_defaults()
     def ellipses(self, *, level: float = 0.9) -> np.ndarray:
         """(S, n, 2, 2) px²: matrices A of the ellipses (x - mode)ᵀ A⁻¹ (x - mode) <= 1 that promise ``level``.
 

@@ -27,6 +27,7 @@ from mmgsd.match.joint import join, spread_places
 from mmgsd.match.match import Match, sort_modes
 from mmgsd.match.mixture import AS_IT_IS, Mixture, Reading, check_count, check_modes, fit_modes, keep_most_probable
 from mmgsd.match.weights import read_weights
+from mmgsd.numerics import own_numerics
 from mmgsd.paths import find_shipped
 
 QUARTERS = 4  # turns of an image whose descriptors are averaged: what noise they have differs
@@ -73,7 +74,7 @@ class Matcher:
         check_scales(bandwidth=bandwidth, temperature=temperature)
         check_modes(modes)
         _check_size(size)
-        self.device = torch.device(device or find_device())
+        self.device = torch.device(find_device(device))
         self.network = network.eval().to(self.device, memory_format=torch.channels_last)
         self.config, self.modes, self.size = config, modes, size
         self.object = config.object  # "" where a file of weights does not say
@@ -83,6 +84,7 @@ class Matcher:
         self.bandwidth = config.margin / 4 if bandwidth is None and config.method in CONTRASTIVE else bandwidth
 
     @classmethod
+    @own_numerics(gradients=True)
     def load(cls, path: Path | str, *, device: str = "") -> Matcher:
         """Weights from a safetensors file; FileNotFoundError, or ValueError for one that is damaged or not ours."""
         weights = read_weights(path)
@@ -93,7 +95,7 @@ class Matcher:
         matcher.object = weights.object
         return matcher
 
-    @torch.inference_mode()
+    @own_numerics()
     def describe(self, images: list[np.ndarray]) -> list[Outputs]:
         """What the network says of each of the images (H, W, 3) uint8 of any sizes, the mean over quarter turns.
 
@@ -115,9 +117,15 @@ class Matcher:
         size = (image.shape[1], image.shape[0])
         if size[0] * self.size[1] != size[1] * self.size[0]:  # what the model was taught with may be a strip
             check_aspect(size, name)
-        # px: where a level is less than 3 cells across, bfloat16's strided convolution on a CPU reads memory at random
-        least = 12 * self.network.stride
-        return fit_input_size(size, self.size, self.config.input_px, least_px=least)
+        return fit_input_size(size, self.size, self.config.input_px, least_px=self.least_px)
+
+    @property
+    def least_px(self) -> int:
+        """Of the shorter side of what the network is given.
+
+        Where a level is less than 3 cells across, bfloat16's strided convolution on a CPU reads memory at random.
+        """
+        return 12 * self.network.stride
 
     def describe_inputs(self, batch: Tensor) -> Tensor:
         """Descriptors (B, C, h, w) of images (B, 3, H, W) in [0, 1] of the network's input size."""
@@ -129,7 +137,7 @@ class Matcher:
         said = [self.network.describe(turned).turn(-k) for k, turned in enumerate(turns)]
         return Outputs.mean(said)
 
-    @torch.inference_mode()
+    @own_numerics()
     def compute_heatmaps(
         self, said0: Outputs, said1: Outputs, xy: Tensor, size: tuple[int, int], *, mask1: Tensor | None = None
     ) -> Tensor:
@@ -150,7 +158,7 @@ class Matcher:
         total = weighted.sum((1, 2), keepdim=True)
         return torch.where(total > 1e-12, weighted / total.clamp(min=1e-12), heatmap)
 
-    @torch.inference_mode()
+    @own_numerics()
     def compute_visible(
         self, said0: Outputs, said1: Outputs, xy: Tensor, modes: Tensor, sizes: tuple[tuple[int, int], ...]
     ) -> Tensor | None:
@@ -268,7 +276,7 @@ class Pair:
     mask0: np.ndarray | None = None  # (H0, W0) bool, of the caller's
     mask1: np.ndarray | None = None  # (H1, W1) bool
 
-    @torch.inference_mode()
+    @own_numerics()
     def match(self, xy: Any, *, n: Any = None, joint: bool = False) -> Match:
         """As `Matcher.match`."""
         points = check_pixels(xy, self.image0.shape[1::-1])
@@ -277,7 +285,7 @@ class Pair:
         count = check_answers(self.matcher.modes if n is None else n, self.matcher.modes)
         mask = self._find_mask()
         places = spread_places(mask)
-        match = self._match(np.concatenate([points, places.astype(points.dtype)]), None)
+        match = self._match(np.concatenate([points, places.astype(points.dtype)]), None, merge=False)
         order = join(match.xy, mask, match.modes, match.weights, match.spread_px, places=len(places))
         weights = np.take_along_axis(match.weights, order, 1)
         heavy = weights[len(points) if len(places) else 0 :].sum(0) + 1e-9
@@ -292,7 +300,7 @@ class Pair:
                              f"{self.matcher.config.name} learnt no mask")  # fmt: skip
         return self.matcher.resize_mask(self.said[0].mask, self.image0.shape[1::-1]) >= 0.5
 
-    def _match(self, points: np.ndarray, n: Any) -> Match:
+    def _match(self, points: np.ndarray, n: Any, *, merge: bool = True) -> Match:
         size0, size1 = sizes = tuple((im.shape[1], im.shape[0]) for im in (self.image0, self.image1))
         mask1 = None if self.mask1 is None else torch.from_numpy(self.mask1)
         cells = self.matcher.compute_heatmaps(*self.said, torch.from_numpy(points), size0, mask1=mask1)
@@ -300,7 +308,7 @@ class Pair:
         fitted, reading = self.matcher.modes, self.matcher.reading
         scale = compute_scale(size1, self.matcher.size)
         match = make_match(self.image0, self.image1, points, cells, centres, n, fitted=fitted, reading=reading,
-                           scale=scale)  # fmt: skip
+                           scale=scale, merge=merge)  # fmt: skip
         return dataclasses.replace(match, calibration=self.matcher.calibration, **self._look(match, sizes))
 
     def _look(self, match: Match, sizes: tuple[tuple[int, int], ...]) -> dict[str, np.ndarray]:
@@ -348,16 +356,17 @@ def fill_question(question: Iterable[Any]) -> tuple[Any, Any, Any, Any, Any]:
 
 def make_match(
     image0: np.ndarray, image1: np.ndarray, xy: np.ndarray, cells: Tensor, centres: tuple[Tensor, Tensor], n: Any, *,
-    fitted: int = 1, reading: Reading = AS_IT_IS, scale: float = 1.0,
+    fitted: int = 1, reading: Reading = AS_IT_IS, scale: float = 1.0, merge: bool = True,
 ) -> Match:  # fmt: skip
     """The answer that heatmaps (S, h, w) with cell ``centres`` (w,), (h,) px hold, however they were made.
 
-    At least ``fitted`` modes are fitted, of which the ``n`` most probable are returned; None: as many. ``scale`` is
+    At least ``fitted`` modes are fitted, of which the ``n`` most probable are returned; None: as many. Unless ``merge``
+    is false, those on one spot are one (`fit_modes`). ``scale`` is
     `compute_scale`'s, for an entropy that does not depend on the number of image1's pixels.
     """
     wanted = check_count(fitted if n is None else n, "n", queries=len(cells))
     fit, entropy = read_heatmap(cells, "auto" if wanted is None else wanted.clamp(min=fitted), centres,
-                                reading=reading)  # fmt: skip
+                                reading=reading, merge=merge)  # fmt: skip
     fit = fit if wanted is None else keep_most_probable(fit, wanted)
     arrays = (t.cpu().numpy() for t in (fit.modes, fit.weights, fit.covariances, entropy, fit.outside, cells))
     match = Match(image0, image1, xy, *arrays, scale=scale)
@@ -381,12 +390,13 @@ def compute_scale(size: tuple[int, int], trained: tuple[int, int]) -> float:
 
 
 def read_heatmap(
-    heatmap: Tensor, n: int | str | Tensor, centres: tuple[Tensor, Tensor], *, reading: Reading = AS_IT_IS
-) -> tuple[Mixture, Tensor]:
+    heatmap: Tensor, n: int | str | Tensor, centres: tuple[Tensor, Tensor], *, reading: Reading = AS_IT_IS,
+    merge: bool = False,
+) -> tuple[Mixture, Tensor]:  # fmt: skip
     """Mixtures of ``n`` modes and entropies (S,) in nats of heatmaps (S, h, w) with cell ``centres`` (w,), (h,) px."""
     xs, ys = (c.float().to(heatmap.device) for c in centres)
     entropy = compute_entropy(heatmap.flatten(1), float((xs[1] - xs[0]) * (ys[1] - ys[0])))
-    return fit_modes(heatmap, n, xs, ys, reading=reading), entropy
+    return fit_modes(heatmap, n, xs, ys, reading=reading, merge=merge), entropy
 
 
 def _check_size(size: tuple[int, int]) -> None:

@@ -2,7 +2,8 @@
 
 Peaks, one after another, are where it starts, and flattened heatmaps are what it is fitted to first: two components
 that share a strong mode while a weak one has none would stay there (deterministic annealing, Ueda and Nakano, Neural
-Networks 1998). A log-density is linear in (1, x, y, x², xy, y²), so an E-step is one matrix product with these six
+Networks 1998). Where one component gets next to nothing all the same, they are fitted again from the peaks, and the
+likelier fit counts. A log-density is linear in (1, x, y, x², xy, y²), so an E-step is one matrix product with these six
 numbers of every cell, and an M-step, which needs their means, another. Where modes overlap, expectation-maximisation
 creeps: SQUAREM (Varadhan and Roland, Scandinavian Journal of Statistics 2008) leaps.
 
@@ -22,6 +23,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from mmgsd.config import MAX_MODES, ROUNDNESS
+from mmgsd.numerics import own_numerics
 
 ANNEALING, ANNEALING_CYCLES = (4.0, 2.0), 6  # temperatures of the flattened heatmaps fitted first, on half the grid
 CYCLES = 60  # of three EM steps and a leap, at most; a query at rest is left alone
@@ -30,6 +32,8 @@ LEAP = 16.0  # the longest leap, in steps
 KERNEL_CELLS = 1.0  # std of the kernel that finds the initial peaks, in cells twice as long and high
 SPREAD = (1 / 12, 10 / 12, 1 / 12)  # of a cell's mass: to second order what bilinear interpolation to pixels does
 MIN_VARIANCE = 0.05  # cells²
+COLLAPSED = 0.2  # of an equal share of the heatmap: a component with less may have left a peak to none
+EVEN = 0.05  # of the mass may lie anywhere where two fits are compared: who explains the background alone is no better
 PRIOR_WEIGHT = 1.0  # heatmap mass by which each component is a priori as likely as any other
 CHUNK = {"cpu": 2**21, "cuda": 2**26}  # numbers in the largest array of a fit
 MOST_MODES, SAMPLES = 8, 200  # n="auto": the most modes tried; a heatmap weighs as much as so many drawn pixels
@@ -70,6 +74,7 @@ class Mixture:
     outside: Tensor  # (S,) mass of the heatmap outside every mode's 95 % ellipse
 
 
+@own_numerics()
 def fit_modes(
     heatmap: Tensor,
     n: int | str | Tensor,
@@ -78,13 +83,15 @@ def fit_modes(
     *,
     cycles: int = CYCLES,
     reading: Reading = AS_IT_IS,
+    merge: bool = False,
 ) -> Mixture:
     """Fit an n-modal Gaussian mixture to each heatmap by weighted expectation-maximisation.
 
     ``heatmap`` (S, h, w) not negative, ``n`` modes for all or (S,), or "auto" for what the Bayesian information
     criterion prefers; ``xs`` (w,) and ``ys`` (h,) cell centres in px. Symmetric modes are a priori equally likely,
     round and equally wide, the latter two as far as ``reading`` says: that decides which cell belongs to which mode,
-    while the result holds the moments of the mass itself. Raises ValueError for other shapes, ``n`` that is not from 1
+    while the result holds the moments of the mass itself. With ``merge``, modes less than a cell apart are one, and
+    the others absent. Raises ValueError for other shapes, ``n`` that is not from 1
     to `MAX_MODES`, another word, or values that are not finite.
     """
     n, n_max = _check_fit(heatmap, n, xs, ys)
@@ -99,6 +106,7 @@ def fit_modes(
     powered = _raise(mass, reading.power)
     state = _choose_fit(powered, grid, *how) if n is None else _fit(powered, n, n_max, grid, *how)
     state = _measure_shares(mass, state, grid, reading)
+    state = _merge(state) if merge else state
     outside = _measure_outside(mass, state, grid)
     order = state[..., 2].argsort(-1, descending=True)
     state = state.gather(1, order[..., None].expand_as(state))
@@ -118,15 +126,48 @@ def fit_modes(
 
 
 def _fit(mass: Tensor, n: Tensor, n_max: int, grid: tuple[int, int], cycles: int, roundness: float) -> Tensor:
-    """State of the fit to (S, C) mass, in chunks of queries: memory stays bounded."""
+    """State of the fit to (S, C) mass; where a component collapsed, the likelier of that and one from the peaks."""
+    how = n_max, grid, cycles, roundness
+    state = _fit_from(ANNEALING, mass, n, *how)
+    weight = state[..., 2]
+    poor = ((weight > 0) & (weight * n[:, None] < COLLAPSED)).any(1).nonzero()[:, 0]
+    if not len(poor):
+        return state
+    mass, cells, again = mass[poor], _describe_cells(grid, mass.device), _fit_from((), mass[poor], n[poor], *how)
+    before, after = (_compute_log_likelihood(mass, each, cells, even=EVEN) for each in (state[poor], again))
+    state[poor[after > before]] = again[after > before]
+    return state
+
+
+def _fit_from(
+    temperatures: tuple[float, ...], mass: Tensor, n: Tensor, n_max: int, grid: tuple[int, int], cycles: int,
+    roundness: float,
+) -> Tensor:  # fmt: skip
+    """State of the fit to (S, C) mass, flattened before, in chunks of queries: memory stays bounded."""
     coarse, coarse_grid = _halve(mass, grid)
     size = _get_chunk(n_max, coarse)
     parts = zip(coarse.split(size), n.split(size), strict=True)
-    starts = [_anneal(*part, n_max, coarse_grid, roundness) for part in parts]
+    starts = [_anneal(temperatures, *part, n_max, coarse_grid, roundness) for part in parts]
     state = torch.cat(starts) * mass.new_tensor([2, 2, 1, 4, 4, 4])
     state[..., 0] += 0.5 * (grid[1] % 2)  # an odd grid was halved with a column, or a row, of nothing
     state[..., 1] += 0.5 * (grid[0] % 2)
     return _run_em(mass, state, _describe_cells(grid, mass.device), cycles, roundness)
+
+
+def _merge(state: Tensor) -> Tensor:
+    """State where components less than a cell apart are one, with their moments together, and the others absent."""
+    mean, weight, covariance = state.split([2, 1, 3], -1)
+    near = torch.cdist(mean, mean) < 1  # (S, N, N)
+    into = torch.where(near, weight.mT, -1).argmax(-1)  # (S, N), the heaviest that is near
+    for _ in range(2):
+        into = into.gather(1, into)  # of a chain
+    share = F.one_hot(into, state.shape[1]).mT * weight.mT  # (S, N, N), of what each is merged from
+    total = share.sum(-1, keepdim=True)
+    share = share / total.clamp(min=1e-30)
+    middle = share @ mean
+    dx, dy = (mean[:, None] - middle[:, :, None]).unbind(-1)  # (S, N, N)
+    spread = covariance[:, None] + torch.stack([dx * dx, dx * dy, dy * dy], -1)
+    return torch.cat([middle, total, (share[..., None] * spread).sum(2)], -1)
 
 
 def _raise(mass: Tensor, power: float) -> Tensor:
@@ -166,10 +207,12 @@ def _halve(mass: Tensor, grid: tuple[int, int]) -> tuple[Tensor, tuple[int, int]
     return half.flatten(1), half.shape[1:]
 
 
-def _anneal(mass: Tensor, n: Tensor, n_max: int, grid: tuple[int, int], roundness: float) -> Tensor:
-    """State fitted to the flattened mass, less and less flattened."""
+def _anneal(
+    temperatures: tuple[float, ...], mass: Tensor, n: Tensor, n_max: int, grid: tuple[int, int], roundness: float
+) -> Tensor:
+    """State at the peaks, then fitted to the flattened mass, less and less flattened."""
     state, cells = _start(mass, n, n_max, grid), _describe_cells(grid, mass.device)
-    for temperature in ANNEALING:
+    for temperature in temperatures:
         flat = mass ** (1 / temperature)
         flat /= flat.sum(-1, keepdim=True)
         for _ in range(ANNEALING_CYCLES):
@@ -181,7 +224,7 @@ def _interpolate(mass: Tensor, grid: tuple[int, int]) -> Tensor:
     """(S, C) mass whose moments are those of the heatmap at full resolution."""
     matrices = []
     for count in grid:
-        matrix = sum(share * torch.eye(count + 2)[k : k + count] for k, share in enumerate(SPREAD))
+        matrix = sum(share * torch.eye(count + 2, dtype=torch.float32)[k : k + count] for k, share in enumerate(SPREAD))
         matrix[:, 1] += matrix[:, 0]  # none leaves the image
         matrix[:, -2] += matrix[:, -1]
         matrices.append(matrix[:, 1:-1].to(mass.device))
@@ -199,21 +242,21 @@ def _start(mass: Tensor, n: Tensor, n_max: int, grid: tuple[int, int]) -> Tensor
         index = (local * (rest + 1e-3 * local)).flatten(1).argmax(-1)
         row, column = index // w, index % w
         rest = rest * (1 - blur_y[row][:, :, None] * blur_x[column][:, None])
-        peaks.append(torch.stack([column - (w - 1) / 2, row - (h - 1) / 2], -1))
+        peaks.append(torch.stack([column, row], -1) - mass.new_tensor([(w - 1) / 2, (h - 1) / 2]))
     present = torch.arange(n_max, device=n.device) < n[:, None]
-    variance = torch.full(present.shape, KERNEL_CELLS**2, device=n.device)
-    rest = torch.stack([present / n[:, None], variance, 0 * variance, variance], -1)
+    variance = torch.full(present.shape, KERNEL_CELLS**2, dtype=torch.float32, device=n.device)
+    rest = torch.stack([present.float() / n[:, None], variance, 0 * variance, variance], -1)
     return torch.cat([torch.stack(peaks, 1), rest], -1)
 
 
 def _make_kernel(count: int, device: torch.device) -> Tensor:
-    at = torch.arange(count, device=device)
+    at = torch.arange(count, dtype=torch.float32, device=device)
     return torch.exp(-0.5 * ((at[:, None] - at) / KERNEL_CELLS) ** 2)
 
 
 def _describe_cells(grid: tuple[int, int], device: torch.device) -> Tensor:
     """(6, C): 1, x, y, x², xy, y² of each cell, in which log-densities are linear and whose means are moments."""
-    y, x = (torch.arange(count, device=device) - (count - 1) / 2 for count in grid)
+    y, x = (torch.arange(count, dtype=torch.float32, device=device) - (count - 1) / 2 for count in grid)
     x, y = (t.flatten() for t in torch.meshgrid(x, y, indexing="xy"))
     return torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y])
 
@@ -284,10 +327,16 @@ def _compute_log_densities(state: Tensor, cells: Tensor) -> Tensor:
     return torch.stack([at_origin, p * x + q * y, q * x + r * y, -0.5 * p, -q, -0.5 * r], -1) @ cells
 
 
-def _compute_log_likelihood(mass: Tensor, state: Tensor, cells: Tensor) -> Tensor:
-    """Mean log-density (S,) of the mass, each component wider by a cell's own spread: no spike between cells counts."""
+def _compute_log_likelihood(mass: Tensor, state: Tensor, cells: Tensor, *, even: float = 0.0) -> Tensor:
+    """Mean log-density (S,) of the mass, each component wider by a cell's own spread: no spike between cells counts.
+
+    The mixture may have a further part that is ``even`` over the grid.
+    """
     state = state + 2 * SPREAD[0] * state.new_tensor([0, 0, 0, 1, 0, 1])
-    return (_compute_log_densities(state, cells).logsumexp(1) * mass).sum(-1)
+    size = _get_chunk(state.shape[1], mass)
+    parts = zip(mass.split(size), state.split(size), strict=True)
+    floor = mass.new_tensor(2 * math.pi * even / mass.shape[1]).log()
+    return torch.cat([(_compute_log_densities(s, cells).logsumexp(1).logaddexp(floor) * m).sum(-1) for m, s in parts])
 
 
 def _choose_fit(mass: Tensor, grid: tuple[int, int], cycles: int, roundness: float) -> Tensor:

@@ -35,12 +35,14 @@ from mmgsd.measure.uncertainty import (
     measure_modes,
     recalibrate,
 )
+from mmgsd.numerics import own_numerics
 
 BANDWIDTHS = (1 / 64, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2)  # of a contrastive heatmap, in margins
 TEMPERATURES = (0.1, 10.0)  # range in which the calibrated one is sought
 PAIRS, LEAST_PAIRS = 400, 40  # drawn, and the fewest: half of these can just tell the level of 95 %
 
 
+@own_numerics()
 def calibrate_weights(
     weights: Path | str, dataset: Path | str, *, pairs: int = PAIRS, points: int = 40, overwrite: bool = False,
     progress: bool = True,
@@ -66,6 +68,7 @@ def calibrate_weights(
     return _keep(weights, {"calibration": found})
 
 
+@own_numerics()
 def calibrate_unseen(
     weights: Path | str, unseen: Sequence[Path | str], *, pairs: int = PAIRS, points: int = 40, overwrite: bool = False,
     progress: bool = True,
@@ -113,6 +116,7 @@ def read_calibration(weights: Path | str) -> Calibration | None:
     return None if text is None else parse_calibration(text)
 
 
+@own_numerics()
 def calibrate_modes(
     matcher: Matcher, data: Dataset, *, pairs: int = PAIRS, points: int = 10, seed: int = 0, progress: bool = False
 ) -> Calibration | None:
@@ -187,6 +191,7 @@ def fit_powers(modes: Modes, distance: np.ndarray) -> tuple[float, ...]:
     return tuple(float(np.clip(round(-slope / slopes[0], 4), -3, 3)) for slope in slopes[1:4])
 
 
+@own_numerics()
 def calibrate_bandwidth(matcher: Matcher, data: Dataset, *, pairs: int = 8, points: int = 80, seed: int = 0) -> float:
     """The heatmap bandwidth with the least mean error on ``data``: contrastive descriptors have no scale.
 
@@ -201,6 +206,7 @@ def calibrate_bandwidth(matcher: Matcher, data: Dataset, *, pairs: int = 8, poin
     return matcher.bandwidth
 
 
+@own_numerics()
 def calibrate_temperature(
     matcher: Matcher, data: Dataset, *, pairs: int = 32, points: int = 40, seed: int = 0
 ) -> float:

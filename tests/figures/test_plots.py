@@ -55,6 +55,13 @@ def test_plot_match_leaves_out_absent_modes():
     assert len(plots.plot_match(match).axes[1].patches) == 1
 
 
+def test_modes_without_weight_fade():
+    match = make_match(modes=3)
+    match.weights[0] = [0.98, 0.02, 0.0]
+    opacity = [patch.get_alpha() for patch in plots.plot_match(match).axes[1].patches]
+    assert opacity[0] == 1 and 0 < opacity[1] < 1 and opacity[2] == 0
+
+
 def test_hidden_modes_are_dashed():
     match = dataclasses.replace(make_match(), visible=np.array([[0.9, 0.2]]))
     seen, hidden = plots.plot_match(match).axes[1].patches

@@ -162,8 +162,8 @@ def test_bad_arguments_are_named(change, message, image, mask, xy):
 def test_a_baseline_answers_as_a_matcher_does(method, image, mask):
     match = BaselineMatcher(method, modes=4).match(image, image, [(100, 90), (130.5, 110)], mask1=mask)
     assert (match.modes.shape, match.covariances.shape, match.heatmap.shape) == ((2, 4, 2), (2, 4, 2, 2), (2, 200, 240))
-    nearest = np.linalg.norm(match.modes - match.xy[:, None], axis=-1).min(1)
-    assert nearest.max() < 24  # one and a half of the grid's cells: four modes share one peak and the noise around it
+    nearest = np.nanmin(np.linalg.norm(match.modes - match.xy[:, None], axis=-1), 1)
+    assert nearest.max() < 24  # one and a half of the grid's cells: the modes share one peak and the noise around it
     assert match.best().xy.shape == (2, 2)
 
 
@@ -200,7 +200,7 @@ def test_features_of_ones_own_answer_with_all_matches(kind):
     red, green = matcher.match(image0, image1, [(60, 60), (180, 140)])
     for place in ((40, 150), (190, 50)):
         assert np.linalg.norm(red.modes[0] - place, axis=1).min() < 16
-    assert np.linalg.norm(green.modes[0] - (110, 100), axis=1).min() < 16
+    assert np.nanmin(np.linalg.norm(green.modes[0] - (110, 100), axis=1)) < 16
     (many,) = matcher.match_many([(image0, image1, (60, 60))])
     np.testing.assert_array_equal(many.modes, red.modes)
 

@@ -120,6 +120,43 @@ def test_annealing_finds_wide_and_weak_modes_among_noise(
     assert annealed < 0.6 * measure()
 
 
+@pytest.mark.parametrize(("std_px", "even"), [(5.0, 0.01), (5.0, 0.02), (8.0, 0.02)])
+def test_a_mode_without_mass_goes_to_the_peak_that_has_none(
+    std_px: float, even: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two near peaks share a mode, and a fourth mode lies far off, alone with what spreads evenly."""
+    true = np.array([[143.0, 240.0], [313.0, 343.0], [22.0, 416.0], [144.0, 354.0]])
+    heatmap = (1 - even) * draw_mixture(true, std_px, np.array([0.3, 0.27, 0.24, 0.19])) + even / CELLS**2
+    fit = fit_modes(torch.cat([heatmap, draw_mixture(CORNERS, std_px)]), 4, XS, YS)
+    assert measure_errors(fit.modes[0], true).max() < 5 and fit.weights[0].min() > 0.15
+    assert measure_errors(fit.modes[1], CORNERS).max() < 0.1
+    monkeypatch.setattr(mixture, "COLLAPSED", 0.0)
+    collapsed = fit_modes(heatmap, 4, XS, YS)
+    assert measure_errors(collapsed.modes[0], true).max() > 150 and collapsed.weights[0].min() < 0.01
+
+
+def test_modes_on_one_spot_are_one() -> None:
+    heatmaps = torch.cat([draw_mixture(CORNERS[:3], 8.0), draw_mixture(CORNERS, 8.0)])
+    apart, merged = (fit_modes(heatmaps, 4, XS, YS, merge=merge) for merge in (False, True))
+    assert torch.isfinite(merged.modes).all(-1).sum(1).tolist() == [3, 4]
+    assert ((merged.weights > 0) == torch.isfinite(merged.modes).all(-1)).all()
+    torch.testing.assert_close(merged.weights[0], torch.tensor([1 / 3, 1 / 3, 1 / 3, 0]), rtol=0, atol=0.01)
+    assert measure_errors(merged.modes[0, :3], CORNERS[:3]).max() < 0.1
+    torch.testing.assert_close(merged.modes[1], apart.modes[1])
+    torch.testing.assert_close(merged.covariances[0, 0], apart.covariances[0, 0], rtol=0.05, atol=1)
+
+
+def test_a_merged_mode_is_as_wide_as_its_parts_together() -> None:
+    parts = torch.tensor([[0.0, 0, 0.6, 4, 0, 4], [0.5, 0, 0.2, 9, 1, 9], [1.2, 0, 0.1, 9, 0, 9], [8, 8, 0.1, 1, 0, 1]])
+    merged = mixture._merge(parts[None])[0]  # a chain of three: the last is less than a cell from the second alone
+    x, shares = torch.tensor([0, 0.5, 1.2]), torch.tensor([0.6, 0.2, 0.1]) / 0.9
+    torch.testing.assert_close(merged[:, 2], torch.tensor([0.9, 0, 0, 0.1]))
+    torch.testing.assert_close(merged[0, 0], (shares * x).sum())
+    torch.testing.assert_close(merged[0, 3], (shares * (parts[:3, 3] + (x - merged[0, 0]) ** 2)).sum())
+    torch.testing.assert_close(merged[0, 4:], (shares[:, None] * parts[:3, 4:]).sum(0))
+    torch.testing.assert_close(merged[3], parts[3])
+
+
 @pytest.mark.parametrize("shape", [(64, 64), (63, 64), (64, 61), (33, 47), (5, 4)])
 def test_any_grid_will_do(shape: tuple[int, int]) -> None:
     xs, ys = compute_cell_centres((640, 480), shape)
