@@ -118,8 +118,8 @@ def make_readings_table(rows: Rows) -> str:
     for name in (name for name in sorted(rows) if "power" in rows[name]):
         weights, _, numbers = name.partition("@")
         again = any(other.startswith(f"{weights}@") for other in rows)
-        if numbers or again:
-            row = rows[name]
+        row = rows[name]
+        if (numbers or again) and {"photographs", *SETS} & row.keys():
             labels[name] = f"`{weights}`, power {row['power']:g}, sharpness {row['sharpness']:g}"
     return _make_pictures_lines(rows, labels)
 

@@ -78,7 +78,11 @@ def test_parts_are_told_one_after_another() -> None:
 
 def test_ways_of_reading_stand_beside_the_weights_own() -> None:
     means, own = {"power": 1.0, "sharpness": 1.0}, {"power": 1.5, "sharpness": 4.0}
-    rows = {"rope": {**own}, "cloth@1,1": {**means, "paper": {"rmse_mean": 25.6}}, "cloth": {**own, **ROWS["cloth"]}}
+    rows = {
+        "rope": {**own}, "cloth-spcl@1,6": {**own, "cloth_renders": {}},
+        "cloth@1,1": {**means, "paper": {"rmse_mean": 25.6}},
+        "cloth": {**own, **ROWS["cloth"]},
+    }  # fmt: skip
     lines = make_readings_table(rows).splitlines()
     assert lines[2:] == [
         "| cloth, `cloth`, power 1.5, sharpness 4 | 21.0 | 21.0 | 51 % (40 to 62) | 25 % | 31 % | 8.0 % |",
