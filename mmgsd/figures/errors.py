@@ -10,12 +10,16 @@ import pandas as pd
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from scipy.ndimage import distance_transform_cdt
 
 from mmgsd.dataset import Dataset
 from mmgsd.experiments import get_colour
 from mmgsd.figures.style import (
+    MARK,
+    MODE,
     PAGE_IN,
+    TRUE,
     blend_heatmap,
     check_filled,
     draw_modes,
@@ -64,6 +68,13 @@ def _measure_covered(seen: np.ndarray) -> np.ndarray:
 def summarise_states(described: pd.DataFrame) -> pd.DataFrame:
     """Mean ``rmse_px`` by the states of source (rows) and target (columns)."""
     return described.pivot_table("rmse_px", "state0", "state1", observed=True)
+
+
+def summarise_entropy(described: pd.DataFrame) -> dict[str, float]:
+    """Mean entropy (nats): ``seen`` and ``hidden``, of queries with every and with not every match seen; by target."""
+    kinds = described.hidden.gt(0).map({False: "seen", True: "hidden"})
+    means = [described.groupby(key, observed=True).entropy.mean() for key in (kinds, "state1")]
+    return {str(kind): round(float(mean), 3) for kind, mean in pd.concat(means).items()}
 
 
 @styled
@@ -134,7 +145,10 @@ def plot_worst_queries(described: pd.DataFrame, data: Dataset, matcher: Any, *, 
 
 @styled
 def plot_worst(matches: Sequence[Match], true: Sequence[np.ndarray], errors_px: Sequence[float]) -> Figure:
-    """Source and target of each query side by side: the heatmap, the modes, and the ``true`` (n, 2) px as crosses."""
+    """Source and target of each query side by side: the heatmap, the modes, and the ``true`` (n, 2) px as crosses.
+
+    A legend says what the signs are.
+    """
     check_filled("matches", matches)
     columns, sheet = 4, [np.hstack([m.image0, m.image1]) for m in matches]
     aspect = sheet[0].shape[0] / sheet[0].shape[1]
@@ -151,4 +165,8 @@ def plot_worst(matches: Sequence[Match], true: Sequence[np.ndarray], errors_px: 
         axis.set_title(f"{error:.0f} px", fontsize=6)
     for axis in axes.flat[len(matches) :]:
         axis.remove()
+    signs = {"asked pixel": ("o", MARK, "black"), "mode": ("o", "none", MODE), "true match": ("x", TRUE, TRUE)}
+    handles = [Line2D([], [], ls="", marker=m, mfc=face, mec=edge, ms=5, label=label)
+               for label, (m, face, edge) in signs.items()]  # fmt: skip
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(signs), fontsize=6)
     return figure

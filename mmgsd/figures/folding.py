@@ -17,7 +17,7 @@ from mmgsd.config import OBJECTS
 from mmgsd.figures.style import MARK, PAGE_IN, check_filled, finish_axes, make_grid, mark_pixel, styled
 from mmgsd.files import writing
 
-THUMBNAIL_PX = 160  # sides of a picture
+THUMBNAIL_PX, FRAME_PX = 160, 5  # sides of a picture, and of the frame that says whether it is a success
 WRAPPED, ACROSS = 13, 120  # letters of a line beside such a picture, and of the lines above a row of them
 SLIDE_PX, SLIDE_MS = 300, 1400  # sides of a slide's pictures, and how long it is shown
 PANEL_IN = 2.4  # width of a picture with moves
@@ -116,6 +116,13 @@ def save_slides(slides: Sequence[tuple[np.ndarray, np.ndarray]], path: Path) -> 
     with writing(path) as aside:
         frames[0].save(aside, "WEBP", save_all=True, append_images=frames[1:], duration=SLIDE_MS, loop=0, quality=80)
     return path
+
+
+def mark_success(picture: np.ndarray, success: bool) -> np.ndarray:
+    """The middle square of a picture (H, W, 3) uint8 in a frame, green for a success and red for none."""
+    framed = crop_square(picture).copy()
+    cv2.rectangle(framed, (0, 0), (THUMBNAIL_PX - 1,) * 2, (0, 170, 80) if success else (215, 40, 40), 2 * FRAME_PX)
+    return framed
 
 
 def crop_square(picture: np.ndarray, size_px: int = THUMBNAIL_PX) -> np.ndarray:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,6 +20,7 @@ from scipy.ndimage import gaussian_filter1d
 from mmgsd.config import N_POINTS
 from mmgsd.experiments import ROWS, get_colour, get_label
 from mmgsd.figures.style import (
+    CHANCE_STYLES,
     COLUMN_IN,
     MARK,
     PAGE_IN,
@@ -39,6 +42,8 @@ from mmgsd.measure.metrics import BIN_PX, ErrorSummary
 
 _ORBIT_COLOURS = ("#D55E00", "#56B4E9", "#FFE100", "#009E73")
 SEGMENTS = 25  # of a rope
+OTHER_SEED = re.compile(r"mmgsd-[1-9]")
+SHOWN = 0.95  # share of a method's errors that the axis of their distribution holds
 MOST_MODES = 8  # of a material point under any group
 PAGE_QUERIES, PANEL_PX = 100, 640  # on one page at most; the longer side of an image in a panel of it
 
@@ -119,7 +124,8 @@ def plot_rmse_pdf(errors: Mapping[str, Mapping[str, ErrorSummary]], object_sizes
         for method, summary in methods.items():
             axis.plot(*compute_density(summary.histogram, step), **get_line_style(method))
             cumulated = np.cumsum(summary.histogram)
-            far = max(far, step * (1 + int(np.searchsorted(cumulated, 0.99 * cumulated[-1]))))
+            if method not in CHANCE_STYLES or len(methods) == 1:  # chance would leave half of the axis empty
+                far = max(far, step * (1 + int(np.searchsorted(cumulated, SHOWN * cumulated[-1]))))
         axis.set(title=name.capitalize(), ylabel="Density per %", ylim=(0, None))
     axes[-1, 0].set(xlabel="Error (% of the object's bounding-box diagonal)", xlim=(0, far))
     add_legend(figure, axes[:, 0])
@@ -132,14 +138,14 @@ def plot_spatial_rmse(
 ) -> Figure:
     """Mean error over the rope's length for every method (1-D), and over the cloth's area for those ``mapped`` (2-D).
 
-    ``errors`` {"rope", "cloth": {method: summary}}; the maps, of the ``mapped`` that are in it, share one scale, points
-    never asked stay grey.
+    ``errors`` {"rope", "cloth": {method: summary}}; each map, of the ``mapped`` that are in it, has a scale of its own,
+    so that a lesser error's map is not flat; points never asked stay grey.
     """
     for name in ("rope", "cloth"):
         check_filled(f"errors[{name!r}]", errors.get(name, {}))
     mapped = [method for method in mapped if method in errors["cloth"]]
     figure, axes = plt.subplots(1, 1 + len(mapped), figsize=(PAGE_IN, 2.1), layout="constrained",
-                                width_ratios=[2.0] + [1.0] * len(mapped))  # fmt: skip
+                                width_ratios=[1.8] + [1.0] * len(mapped))  # fmt: skip
     for method, summary in errors["rope"].items():
         seen = np.flatnonzero(summary.asked)
         mean = pd.Series(summary.mean_px[seen]).groupby(seen * SEGMENTS // N_POINTS).mean()
@@ -147,17 +153,22 @@ def plot_spatial_rmse(
     axes[0].set(title="Rope", xlabel="Position along the rope (%)", ylabel="RMSE (px)", xlim=(0, 100), ylim=(0, None))
     maps = [errors["cloth"][method].mean_px.reshape(25, 25) for method in mapped]
     for axis, method, values in zip(axes[1:], mapped, maps, strict=True):
-        image = axis.imshow(values, cmap=colormaps["viridis"].with_extremes(bad="0.85"), vmin=0, vmax=np.nanmax(maps))
-        axis.set_title(f"Cloth · {get_label(method, short=True)}")
+        image = axis.imshow(values, cmap=colormaps["viridis"].with_extremes(bad="0.85"))
+        axis.set_title(f"Cloth · {get_label(method, short=True)}, RMSE (px)")
+        figure.colorbar(image, ax=axis, shrink=0.8)
     name_grid(axes[1:])
-    figure.colorbar(image, ax=axes[1:], label="RMSE (px)", shrink=0.8)
     add_legend(figure, axes[:1])
     return finish_axes(figure, keep_box=axes[1:])
 
 
 @styled
-def plot_sigma_ablation(results: Mapping[str, Mapping[str, Mapping[str, float]]]) -> Figure:
-    """``rmse_mean`` of MMGSD against the std σ of its targets: ``results`` {object: {σ px: {metric: value}}}."""
+def plot_sigma_ablation(
+    results: Mapping[str, Mapping[str, Mapping[str, float]]], *, seeds: Mapping[str, Mapping[str, Any]] | None = None
+) -> Figure:
+    """``rmse_mean`` of MMGSD against the std σ of its targets: ``results`` {object: {σ px: {metric: value}}}.
+
+    Rings at σ = 1 px are ``seeds`` {object: {"mmgsd-1": {metric: value}}} of the same training, but for the seed 0.
+    """
     for name, rows in {"": results, **results}.items():
         check_filled(f"results[{name!r}]" if name else "results", rows)
     figure, axes = plt.subplots(1, len(results), figsize=(COLUMN_IN, 1.7), layout="constrained", squeeze=False)
@@ -165,6 +176,8 @@ def plot_sigma_ablation(results: Mapping[str, Mapping[str, Mapping[str, float]]]
         points = sorted((float(sigma), metrics["rmse_mean"]) for sigma, metrics in rows.items())
         sigma, error = zip(*points, strict=True)
         axis.plot(sigma, error, "o-", ms=3.5, color=get_colour("mmgsd"))
+        others = [row["rmse_mean"] for key, row in (seeds or {}).get(name, {}).items() if OTHER_SEED.match(key)]
+        axis.plot([1.0] * len(others), others, "o", ms=3.5, mfc="none", color=get_colour("mmgsd"))
         for x, y in points:
             axis.annotate(f"{y:.1f}", (x, y), xytext=(0, 4), textcoords="offset points", ha="center", fontsize=6.5)
         axis.set_xscale("log", base=2)

@@ -10,7 +10,7 @@ from mmgsd.config import OBJECTS
 from mmgsd.experiments import get_colour, get_label
 from mmgsd.figures.style import PAGE_IN, check_filled, finish_axes, styled
 from mmgsd.match.baselines import BASELINES
-from mmgsd.report.shipped import Rows, list_names
+from mmgsd.report.shipped import Rows, get_photographs, list_names
 
 PANELS = (  # a title, what is measured there, and times what
     ("Clean renders", "paper", "rmse_mean", 1.0, "RMSE (px)"),
@@ -33,7 +33,7 @@ def plot_robustness(rows: Rows) -> Figure:
     figure, axes = plt.subplots(1, len(PANELS), figsize=size, layout="constrained", sharey=True)
     for axis, (title, part, key, scale, unit) in zip(axes, PANELS, strict=True):
         for place, name in enumerate(names):
-            value = rows[name].get(part, {}).get(key)
+            value = (get_photographs(rows, name) if part == "photographs" else rows[name].get(part, {})).get(key)
             _draw_bar(axis, place + 0.6 * (not name.startswith(OBJECTS[0])), name, value and scale * value)
         axis.set(title=title, xlabel=unit)
     widest = 1.12 * max(1.0, *(axis.dataLim.x1 for axis in axes[:2]))
@@ -46,12 +46,12 @@ def plot_robustness(rows: Rows) -> Figure:
 
 
 def _label(name: str) -> str:
-    object, _, kind = name.partition("-")
+    object, _, kind = name.partition("@")[0].partition("-")
     return f"{object.capitalize()}: {LABELS.get(kind) or get_label(kind)}"
 
 
 def _draw_bar(axis: Axes, place: float, name: str, value: float | None) -> None:
     if value is None:
         return
-    axis.barh(place, value, height=0.72, color=COLOURS[name.partition("-")[2]])
+    axis.barh(place, value, height=0.72, color=COLOURS[name.partition("@")[0].partition("-")[2]])
     axis.annotate(f"{value:.0f}", (value, place), xytext=(2, 0), textcoords="offset points", va="center", fontsize=6.5)

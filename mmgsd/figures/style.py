@@ -26,9 +26,11 @@ from mmgsd.match.describe import find_hidden, say_presence
 from mmgsd.match.match import Match
 
 CHANCE_STYLES = {"centre": "--", "random": ":"}
+ABOVE = {"unimodal": (0, (4, 2)), "pcl": (0, (4, 2))}  # dashed, on the lines that they lie on: MMGSD's, SPCL's
 COLUMN_IN, PAGE_IN = 3.5, 7.1  # widths of a column and of a page
 MARK = "#FFE100"  # the asked pixel
 TRUE = "#00FF6A"  # the sign of true matches
+MODE = "#00E0FF"  # that of modes
 
 HEAT = colormaps["inferno"](np.linspace(0.3, 1, 256))[:, :3].astype(np.float32)  # from cold to hot
 FAINT = 0.35  # opacity of modes where there is no answer
@@ -98,7 +100,7 @@ def draw_modes(axis: Axes, match: Match, index: int) -> None:
         ellipse = Ellipse((x, y), *(2 * radii), angle=np.degrees(angle), fill=False, ec="white", lw=0.7, **stroke)
         axis.add_patch(ellipse)
         size = 4 + 40 * match.weights[index, k]
-        axis.scatter(x, y, s=size, c="none", edgecolors="#00E0FF", linewidths=0.9, **stroke)
+        axis.scatter(x, y, s=size, c="none", edgecolors=MODE, linewidths=0.9, **stroke)
 
 
 def compute_ellipse(covariance: np.ndarray) -> tuple[np.ndarray, float]:
@@ -142,7 +144,8 @@ def fade_image(image: np.ndarray) -> np.ndarray:
 def get_line_style(method: str) -> dict:
     """Label, colour and stroke of a method's line; chance is broken, MMGSD on top."""
     style = {"label": get_label(method, short=True), "color": get_colour(method)}
-    return style | {"linestyle": CHANCE_STYLES.get(method, "-"), "zorder": 4 if method == "mmgsd" else 2}
+    order = 5 if method in ABOVE else 4 if method == "mmgsd" else 2
+    return style | {"linestyle": (CHANCE_STYLES | ABOVE).get(method, "-"), "zorder": order}
 
 
 def make_grid(aspects: Sequence[float], columns: int, width: float) -> tuple[Figure, np.ndarray]:

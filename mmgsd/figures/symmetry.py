@@ -1,4 +1,4 @@
-"""Where on a cloth a symmetry group's errors lie: as maps, and by region."""
+"""Where on a cloth a symmetry group's errors lie: as maps, by ring, and by region."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from matplotlib.figure import Figure
 
 from mmgsd.experiments import get_colour
 from mmgsd.figures.style import PAGE_IN, check_filled, finish_axes, name_grid, styled
-from mmgsd.measure.regions import MAP, SIDE
+from mmgsd.measure.regions import MAP, SIDE, measure_rings
 
 
 @styled
 def plot_symmetry_study(places: Mapping[str, Mapping[str, Any]]) -> Figure:
-    """Maps of the RMSE over the cloth on one scale, and error and entropy by region.
+    """Maps of the RMSE over the cloth on one scale, and the error by ring, from the border inwards, and by region.
 
     ``places`` {group: what `mmgsd.measure.regions.summarise_places` gives}.
     """
@@ -32,10 +32,12 @@ def plot_symmetry_study(places: Mapping[str, Mapping[str, Any]]) -> Figure:
     name_grid(axes[: len(places)])
     bar = figure.colorbar(image, ax=axes[: len(places)], shrink=0.75)
     bar.ax.set_title("RMSE\n(px)", fontsize=7)
-    for axis, name, label in zip(axes[-2:], ("rmse_px", "entropy"), ("RMSE (px)", "Entropy (nats)"), strict=True):
-        _draw_regions(axis, {group: {r: row[name] for r, row in shown["regions"].items()}
+    for group, row in places.items():
+        axes[-2].plot(np.array(measure_rings(row[MAP]), float), color=get_colour(group))
+    axes[-2].set(xlabel="Points from the border", ylabel="RMSE (px)", ylim=(0, None), xlim=(0, SIDE // 2))
+    _draw_regions(axes[-1], {group: {r: row["rmse_px"] for r, row in shown["regions"].items()}
                              for group, shown in places.items()})  # fmt: skip
-        axis.set_ylabel(label)
+    axes[-1].set_ylabel("RMSE (px)")
     figure.legend(*axes[-1].get_legend_handles_labels(), loc="outside upper right", ncols=len(places), handlelength=1)
     return finish_axes(figure, keep_box=axes[: len(places)])
 

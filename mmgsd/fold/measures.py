@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.stats import binomtest
 
 from mmgsd.fold.tasks import fit_motion
 
@@ -73,6 +74,19 @@ def estimate_mean(values: np.ndarray, *, seed: int = 0) -> dict[str, float | int
     drawn = np.random.default_rng(seed).choice(values, (DRAWS, len(values))).mean(1)
     low, high = np.quantile(drawn, [0.025, 0.975])
     numbers = {"mean": values.mean(), "low": low, "high": high}
+    return {name: round(float(value), 5) for name, value in numbers.items()} | {"count": len(values)}
+
+
+def estimate_share(values: Sequence[bool]) -> dict[str, float | int | None]:
+    """As `estimate_mean` of (N,) successes, by Wilson's interval: 0 and 100 % have one that is wider than nothing.
+
+    Wilson, "Probable inference, the law of succession, and statistical inference" (1927).
+    """
+    if not len(values):
+        return {"mean": None, "low": None, "high": None, "count": 0}
+    found = binomtest(int(np.sum(values)), len(values))
+    interval = found.proportion_ci(method="wilson")
+    numbers = {"mean": found.statistic, "low": interval.low, "high": interval.high}
     return {name: round(float(value), 5) for name, value in numbers.items()} | {"count": len(values)}
 
 

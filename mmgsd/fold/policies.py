@@ -46,6 +46,7 @@ POLICIES = {
     for policy in (
         Policy("truth", "true matches", "#404040"),
         Policy("mmgsd", "MMGSD, modes that agree", "#D55E00", "", AGREE),
+        Policy("mmgsd_paper", "MMGSD of clean images alone, modes that agree", "#B22222", "-paper", AGREE),
         Policy("mmgsd_again", "the same, looks again if unsure", "#8A3500", "", AGREE, looks=3),
         Policy("mmgsd_joint", "MMGSD, surest joint answer", "#F0A070", "", JOINT),
         Policy("mmgsd_best", "MMGSD, each pixel's surest", "#A6761D", "", BEST),
@@ -57,11 +58,12 @@ POLICIES = {
         Policy("quick_one", f"Unimodal, as `{TRAINED_BY}` trains it, one mode", get_colour("unimodal"), "", AGREE,
                "unimodal", one=True),
         Policy("random", "random points", "#9A9A9A"),
+        Policy("nothing", "nothing is done", "#CCCCCC"),
     )
 }  # fmt: skip
 
 
-SHIPPED = tuple(policy for policy in POLICIES.values() if not policy.trained)
+SHIPPED = tuple(policy for policy in POLICIES.values() if not policy.trained and policy.name != "nothing")
 
 
 def find_policy(name: str) -> Policy:

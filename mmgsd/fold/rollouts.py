@@ -21,15 +21,15 @@ import numpy as np
 from mmgsd.checks import check_choice
 from mmgsd.command import run_command
 from mmgsd.config import DEFAULT_GROUP, OBJECTS
-from mmgsd.figures.folding import mark_moves, plot_rollouts, plot_success, save_slides
+from mmgsd.figures.folding import mark_moves, mark_success, plot_rollouts, plot_success, save_slides
 from mmgsd.figures.style import save_figure
 from mmgsd.files import DamagedFileError, read_json, set_aside, write_json
 from mmgsd.fold.agreement import Motion
 from mmgsd.fold.demonstration import Demonstration, Look, write_demonstration
-from mmgsd.fold.measures import SIDES_M, SUCCESS, compare_rollouts, estimate_mean, measure_outcome
+from mmgsd.fold.measures import SIDES_M, SUCCESS, compare_rollouts, estimate_mean, estimate_share, measure_outcome
 from mmgsd.fold.moves import Answer, choose_moves
 from mmgsd.fold.policies import POLICIES, SHIPPED, TRAINED_BY, Policy, ask, digest_policy, draw_moves
-from mmgsd.fold.tasks import GROUNDS, TASKS, Task
+from mmgsd.fold.tasks import GROUNDS, TASKS, Task, find_task
 from mmgsd.match.camera import compute_rays
 from mmgsd.paths import Paths, find_root
 from mmgsd.progress import ProgressBar
@@ -38,6 +38,7 @@ from mmgsd.scene.state import State, read_state
 from mmgsd.symmetry import load_group
 
 ROLLOUTS = {"smoke": 2, "quick": 36, "paper": 100}  # of each policy and object
+MORE = ("wrinkled", 0.4)  # a start of which few rollouts count, and how many more begin from it, of the count
 DEMONSTRATIONS = "demonstrations"  # instead of a preset: write these alone
 REFERENCE = "mmgsd"  # the policy that the others are compared with, rollout by rollout
 QUALITY = 90  # of the images of demonstrations as files
@@ -62,9 +63,12 @@ class Rollout:
 
 
 def list_rollouts(object: str, count: int) -> list[Rollout]:
-    """``count`` rollouts of an object, its tasks, their starts and the grounds in turn."""
+    """``count`` rollouts of an object, its tasks, their starts and the grounds in turn; then those of `MORE`."""
     kinds = [(task.name, start) for task in TASKS.values() if task.object == object for start in task.starts]
-    return [Rollout(*kinds[k % len(kinds)], GROUNDS[k // len(kinds) % len(GROUNDS)], k) for k in range(count)]
+    more = [kind for kind in kinds if kind[1] == MORE[0]]
+    turns = [(kinds, k) for k in range(count)] + [(more, k) for k in range(int(MORE[1] * count) if more else 0)]
+    return [Rollout(*chosen[k % len(chosen)], GROUNDS[k // len(chosen) % len(GROUNDS)], seed)
+            for seed, (chosen, k) in enumerate(turns)]  # fmt: skip
 
 
 def run_folding(
@@ -90,9 +94,13 @@ def run_folding(
         starts = bench.make_starts(rollouts)
         kept = [rollout for rollout in rollouts if not read_state(starts[rollout]).about["fault"]]
         found = bench.roll(policies, kept, starts)
-        pictures |= bench.list_pictures(policies, kept, starts)
-        slides += [pair for policy in policies if policy.name == REFERENCE for pair in bench.list_slides(policy, kept)]
-        reachable = {key for key, row in found.get("truth", {}).items() if row["success"]} - bench.list_done(starts)
+        shown = choose_shown(kept, found.get(REFERENCE, {}))
+        pictures |= bench.list_pictures(policies, shown, starts, found)
+        slides += [pair for policy in policies if policy.name == REFERENCE for pair in bench.list_slides(policy, shown)]
+        untouched = bench.judge_untouched({rollout: starts[rollout] for rollout in kept})
+        done = {name for name, row in untouched.items() if row["success"]}
+        reachable = {key for key, row in found.get("truth", {}).items() if row["success"]} - done
+        rows[object]["nothing"] = summarise_rollouts(untouched, reachable)
         for policy in policies:
             rows[object][policy.name] = summarise_rollouts(found[policy.name], reachable)
         rows[object] = {name: rows[object][name] for name in POLICIES if name in rows[object]}
@@ -133,8 +141,8 @@ class Bench:
 
     def make_starts(self, rollouts: list[Rollout]) -> dict[Rollout, Path]:
         """First states, and before them the states that the rollouts' demonstrations go through."""
-        self.demonstrate({rollout.task: TASKS[rollout.task] for rollout in rollouts}.values())
-        jobs = {r.name: start_job(TASKS[r.task], r.start, r.ground, r.seed) for r in rollouts}
+        self.demonstrate({rollout.task: find_task(rollout.task) for rollout in rollouts}.values())
+        jobs = {r.name: start_job(find_task(r.task), r.start, r.ground, r.seed) for r in rollouts}
         files = run_jobs(jobs, self.folder / "starts", **self.how)
         return {rollout: files[rollout.name] for rollout in rollouts}
 
@@ -162,9 +170,9 @@ class Bench:
             looks.append(Look(state.image, pixels.reshape(-1, 2, 2), state.xy[anchors].astype(float)))
         return Demonstration(task.object, tuple(looks))
 
-    def list_done(self, starts: Mapping[Rollout, Path]) -> set[str]:
-        """Names of the rollouts whose first state is a success already: who does nothing must not be praised."""
-        return {rollout.name for rollout, file in starts.items() if self._judge(rollout, file, [])["success"]}
+    def judge_untouched(self, starts: Mapping[Rollout, Path]) -> dict[str, dict[str, Any]]:
+        """{rollout: how it is before anything is done}: who does nothing must not be praised."""
+        return {rollout.name: self._judge(rollout, file, []) for rollout, file in starts.items()}
 
     def roll(
         self, policies: list[Policy], rollouts: list[Rollout], starts: dict[Rollout, Path]
@@ -172,8 +180,8 @@ class Bench:
         """{policy: {rollout: how it ended}} of every policy from every first state."""
         files = {(policy, rollout): starts[rollout] for policy in policies for rollout in rollouts}
         answers: dict[tuple[Policy, Rollout], list[Answer]] = {arm: [] for arm in files}
-        for number in range(max(len(TASKS[rollout.task].looks) for rollout in rollouts)):
-            going = [arm for arm in files if len(TASKS[arm[1].task].looks) > number]
+        for number in range(max(len(find_task(rollout.task).looks) for rollout in rollouts)):
+            going = [arm for arm in files if len(find_task(arm[1].task).looks) > number]
             for arm in ProgressBar(going, desc="answer", disable=not self.how["progress"], leave=False):
                 answers[arm].append(self._answer(*arm, number, files[arm], answers[arm]))
             self._look_again(going, number, files, answers)
@@ -205,27 +213,33 @@ class Bench:
                     files[arm], answers[arm][-1] = file, answer
 
     def list_pictures(
-        self, policies: list[Policy], rollouts: list[Rollout], starts: dict[Rollout, Path]
-    ) -> dict[str, dict[str, np.ndarray]]:
-        """{task's label: {what is seen: picture}} of a rollout of each task: demonstration, start, policies' ends."""
-        first = {rollout.task: rollout for rollout in reversed(rollouts)}
+        self, policies: list[Policy], rollouts: Mapping[str, Rollout], starts: dict[Rollout, Path],
+        found: Mapping[str, Mapping[str, Mapping[str, Any]]],
+    ) -> dict[str, dict[str, np.ndarray]]:  # fmt: skip
+        """{task's label: {what is seen: picture}} of a rollout of each task: demonstration, start, policies' ends.
+
+        ``found`` is as `roll` gives it: the ends are framed by whether they are a success.
+        """
         rows = {}
-        for task in (task for task in TASKS.values() if task.name in first):
-            shown, rollout = self.demonstrated[task.name], first[task.name]
+        for task in (task for task in TASKS.values() if task.name in rollouts):
+            shown, rollout = self.demonstrated[task.name], rollouts[task.name]
             row = {
                 "demonstrated": shown[0].image,
                 "its end": shown[-1].image,
                 "found": read_state(starts[rollout]).image,
             }
             seen = [policy for policy in policies if policy.looks == 1]  # what looks again mostly does the same
-            rows[task.label] = row | {policy.label: read_state(self.ends[policy, rollout]).image for policy in seen}
+            rows[task.label] = row | {
+                policy.label: mark_success(read_state(self.ends[policy, rollout]).image,
+                                           found[policy.name][rollout.name]["success"]) for policy in seen
+            }  # fmt: skip
         return rows
 
-    def list_slides(self, policy: Policy, rollouts: list[Rollout]) -> list[tuple[np.ndarray, np.ndarray]]:
+    def list_slides(self, policy: Policy, rollouts: Mapping[str, Rollout]) -> list[tuple[np.ndarray, np.ndarray]]:
         """Of a rollout of each task, look by look and at its end: the demonstration's picture and the policy's."""
-        first, slides = {rollout.task: rollout for rollout in reversed(rollouts)}, []
-        for task in (task for task in TASKS.values() if task.name in first):
-            shown, arm = self.demonstrated[task.name], (policy, first[task.name])
+        slides = []
+        for task in (task for task in TASKS.values() if task.name in rollouts):
+            shown, arm = self.demonstrated[task.name], (policy, rollouts[task.name])
             for look, (file, answer) in zip(self.make_demonstration(task).looks, self.acted[arm], strict=True):
                 slides.append((mark_moves(look.image, look.moves), mark_moves(read_state(file).image, answer.moves)))
             slides.append((shown[-1].image, read_state(self.ends[arm]).image))
@@ -235,7 +249,7 @@ class Bench:
         self, policy: Policy, rollout: Rollout, number: int, file: Path, before: list[Answer], *, again: int = 0
     ) -> Answer:
         """The moves (px) of one look, kept as a file; asked anew where the state or the policy is another."""
-        state, task = read_state(file), TASKS[rollout.task]
+        state, task = read_state(file), find_task(rollout.task)
         look = f"-look{again}" if again else ""
         place = self.folder / "answers" / f"{policy.name}-{rollout.name}-{number}{look}.json"
         mark = {"state": state.about["mark"], "policy": digest_policy(policy, task.object)}
@@ -247,7 +261,7 @@ class Bench:
         return kept
 
     def _ask(self, policy: Policy, rollout: Rollout, number: int, state: State, motion: Motion | None) -> Answer:
-        task = TASKS[rollout.task]
+        task = find_task(rollout.task)
         shown = self.demonstrated[task.name]
         look = self.make_demonstration(task).looks[number]
         if policy.name == "truth":
@@ -262,7 +276,7 @@ class Bench:
         return Answer(pixels.reshape(-1, 2, 2), answer.motion, answer.share)
 
     def _judge(self, rollout: Rollout, file: Path, answers: list[Answer]) -> dict[str, Any]:
-        state, task = read_state(file), TASKS[rollout.task]
+        state, task = read_state(file), find_task(rollout.task)
         group = load_group(task.object, DEFAULT_GROUP[task.object]).permutations
         end, side = self.demonstrated[task.name][-1].points, SIDES_M[task.object]
         outcome = measure_outcome(state.points.astype(float), end.astype(float), group, task.object)
@@ -270,6 +284,16 @@ class Bench:
         return {"task": task.name, "error": outcome.error_m / side, "overlap": outcome.overlap,
                 "success": not failed and outcome.error_m < SUCCESS * side, "fault": state.about["fault"],
                 "share": min([1.0, *(answer.share for answer in answers)])}  # fmt: skip
+
+
+def choose_shown(rollouts: list[Rollout], ended: Mapping[str, Mapping[str, Any]]) -> dict[str, Rollout]:
+    """{task: the rollout that is drawn}, by rule: of each task the one with the median error where it ``ended``."""
+    tasks: dict[str, list[Rollout]] = {}
+    for rollout in rollouts:
+        tasks.setdefault(rollout.task, []).append(rollout)
+    for found in tasks.values():
+        found.sort(key=lambda rollout: ended[rollout.name]["error"] if rollout.name in ended else 0.0)
+    return {task: found[len(found) // 2] for task, found in tasks.items()}
 
 
 def find_on_table(xy: np.ndarray, state: State) -> np.ndarray:
@@ -288,12 +312,16 @@ def summarise_rollouts(rows: dict[str, dict[str, Any]], reachable: set[str]) -> 
     """
     groups = {"all": list(rows.values()), "reachable": [row for name, row in rows.items() if name in reachable]}
     groups |= {task: [row for row in rows.values() if row["task"] == task] for task in TASKS}
-    said = {name: {key: estimate_mean([min(row[key], 1.0) for row in found]) for key in ("error", "overlap", "success")}
-            for name, found in groups.items() if found}  # fmt: skip
-    sure = [float(row["success"]) for name, row in rows.items() if row["share"] >= AGREES and name in reachable]
+    said = {
+        name: {key: estimate_mean([min(row[key], 1.0) for row in found]) for key in ("error", "overlap")}
+        | {"success": estimate_share([row["success"] for row in found])}
+        for name, found in groups.items()
+        if found
+    }
+    sure = [row["success"] for name, row in rows.items() if row["share"] >= AGREES and name in reachable]
     each = {name: [round(min(row["error"], 1.0), 4), bool(row["success"])] for name, row in rows.items()}
     faults = sum(bool(row["fault"]) for row in rows.values())
-    return {**said, "cautious": estimate_mean(sure), "faults": faults, "rollouts": each}
+    return {**said, "cautious": estimate_share(sure), "faults": faults, "rollouts": each}
 
 
 def _read_answer(path: Path, mark: dict[str, str]) -> Answer | None:
@@ -331,7 +359,7 @@ def main() -> None:
         how = {"workers": args.workers, "scheduler": args.scheduler}
         print("\n".join(map(str, write_demonstrations(find_root(), **how))))
         return
-    asked = [policy for policy in POLICIES.values() if bool(policy.trained) == args.trained]
+    asked = [policy for policy in POLICIES.values() if policy.trained] if args.trained else SHIPPED
     policies = [POLICIES["truth"], *(p for p in asked if args.only in p.name and p.name != "truth")]
     if not any(args.only in policy.name for policy in asked):
         parser.error(

@@ -69,11 +69,14 @@ TASKS = {
     )
 }  # fmt: skip
 
+GRASP = Task("grasp", "a corner to the middle", "cloth", ((Move(_A, (0.0, 0.0)),),), STARTS["cloth"], "flat")
+
 
 def find_task(name: str) -> Task:
-    """The task of a name; ValueError, which names the accepted, for any other."""
-    check_choice("task", name, tuple(TASKS))
-    return TASKS[name]
+    """The task of a name, one of `TASKS` or `GRASP`; ValueError, which names the accepted, for any other."""
+    tasks = TASKS | {GRASP.name: GRASP}
+    check_choice("task", name, tuple(tasks))
+    return tasks[name]
 
 
 def fit_motion(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

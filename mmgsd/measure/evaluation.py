@@ -18,7 +18,7 @@ from mmgsd.dataset_format import UNREADABLE
 from mmgsd.files import DamagedFileError, read_json, saying_what_stays, set_aside, write_json, writing
 from mmgsd.match.baselines import BASELINES, BaselineMatcher
 from mmgsd.match.matcher import Matcher, check_scales, read_heatmap
-from mmgsd.match.mixture import Mixture, Reading, check_modes
+from mmgsd.match.mixture import AS_IT_IS, Mixture, Reading, check_modes
 from mmgsd.measure.metrics import aggregate
 from mmgsd.measure.questions import Answer, ask, model_answer
 
@@ -65,18 +65,22 @@ def evaluate_model(
 
 def evaluate_baseline(
     method: str, dataset: Path, config: EvaluateConfig, out: Path, *,
-    group: str = "", overwrite: bool = False, progress: bool = True,
+    group: str = "", reading: Reading = AS_IT_IS, overwrite: bool = False, progress: bool = True,
 ) -> Path:  # fmt: skip
-    """Ask hand-made descriptors, or chance (``centre``, ``random``), the same queries; ValueError for others."""
+    """Ask hand-made descriptors, or chance (``centre``, ``random``), the same queries; ValueError for others.
+
+    ``reading`` of the descriptors' modes.
+    """
     if method not in BASELINES + CHANCE:
         raise ValueError(f"method must be one of {BASELINES + CHANCE}, got {method!r}")
     overwrite, progress = read_flag("overwrite", overwrite), read_flag("progress", progress)
     out = Path(out)
     data = load_dataset(dataset, "test")
-    question = _describe_question(data, config, group, method)
+    asked = method if reading == AS_IT_IS else f"{method} by {reading}"
+    question = _describe_question(data, config, group, asked)
     if not overwrite and _is_answered(out, question):
         return out
-    answer = _chance_answer(method, data) if method in CHANCE else _classical_answer(method, data)
+    answer = _chance_answer(method, data) if method in CHANCE else _classical_answer(method, data, reading)
     return _answer_all(answer, data, config, group, out, question, progress)
 
 
@@ -142,7 +146,7 @@ def _is_nested(values: Any, depth: int) -> bool:
     return isinstance(values, dict) and (depth == 0 or all(_is_nested(value, depth - 1) for value in values.values()))
 
 
-def _classical_answer(method: str, data: Dataset) -> Answer:
+def _classical_answer(method: str, data: Dataset, reading: Reading) -> Answer:
     images = [data.load_image(i) for i in range(len(data))]
     masks = [data.load_mask(i) for i in range(len(data))]
     matcher, last = BaselineMatcher(method), np.array(data.size, dtype=np.float32) - 0.5
@@ -151,7 +155,7 @@ def _classical_answer(method: str, data: Dataset) -> Answer:
         """Modes and entropies (nats) of pixels ``xy`` of the first image."""
         xy = np.clip(xy, -0.5, last)  # a corner may stick out of the image: the networks take its nearest pixel as well
         heatmap, centres = matcher.compute_heatmaps(images[first], images[second], xy, masks[second])
-        return read_heatmap(heatmap, torch.from_numpy(n), centres)
+        return read_heatmap(heatmap, torch.from_numpy(n), centres, reading=reading)
 
     return answer
 

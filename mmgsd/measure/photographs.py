@@ -10,7 +10,8 @@ The photographs are described by a JSON file, a list of dictionaries, one a phot
     ends      of a rope
     marks     of another object: places that look alike
     size_px   of the object; default: the mean of a cloth's sides where all corners are seen, else half the image's
-              longer side, or 0.65 of it where stickers mark the corners (these photographs are cropped to the cloth)
+              longer side, or 0.65 of it where stickers mark the corners or lie near them (``stickers``, px): these
+              photographs are cropped to the cloth
 
 The first of the five that is there counts. Each place of `SOURCES` photographs, evenly spread over the file (of cloths
 only those with all corners), is asked for in every other photograph with places:
@@ -18,6 +19,8 @@ only those with all corners), is asked for in every other photograph with places
     found@5%, found@10%   share of the marked places that have a mode nearer than 5, 10 % of the object's size
     spurious              share of the k most probable modes, k the marked places, farther than 10 % from all of them
     best                  distance of `Match.best` to the nearest marked place, % of the size; of answers that give one
+
+All are means over queries; their 95 % intervals are by bootstrap over the photographs, each with all its queries.
 """
 
 from __future__ import annotations
@@ -45,6 +48,7 @@ SOURCES = 4  # photographs whose places are asked for
 INDEX = "index.json"  # of a folder of photographs
 PLACES = ("corners", "visible_corner_stickers", "visible_corners_unordered", "ends", "marks")
 MEASURES = ("found@5%", "found@10%", "spurious", "best")
+DRAWS = 2000  # of a bootstrap
 SIZE_SHARE, STICKERED_SHARE = 0.5, 0.65  # of the image's longer side: an object whose size is not known
 ENDS = {"cloth": ("corners", (0, 24, 624, 600)), "rope": ("ends", (0, 624))}  # material points to mark
 
@@ -104,7 +108,7 @@ def _read_entry(path: Path, number: int, entry: dict[str, Any]) -> Photograph | 
     xy = np.array(marked, float)
     if size_px is None and whole:
         size_px = float(np.linalg.norm(xy - np.roll(xy, 1, 0), axis=1).mean())
-    share = STICKERED_SHARE if entry.get("visible_corner_stickers") else SIZE_SHARE
+    share = STICKERED_SHARE if entry.get("visible_corner_stickers") or entry.get("stickers") else SIZE_SHARE
     askable = whole or by in ("ends", "marks")
     return Photograph(find_beside(path, name), str(entry.get("repo") or "own"), xy, size_px, share, askable)
 
@@ -140,12 +144,19 @@ def measure_answers(
     matcher: Any, photographs: list[Photograph], *, progress: bool = True,
     seen: Callable[[Photograph, Match], None] = lambda *_: None,
 ) -> dict[str, Any]:  # fmt: skip
-    """The number of photographs and `summarise_photographs` of the answers of anything with ``match_many``."""
+    """Number and ``marks`` of photographs, `summarise_photographs` of the answers of anything with ``match_many``."""
     rows = []
     for photograph, answer in ask_photographs(matcher, photographs, progress=progress):
         seen(photograph, answer)
         rows.append(score_answer(answer, photograph))
-    return {"photographs": len(photographs), **summarise_photographs(pd.concat(rows, ignore_index=True))}
+    about = {"photographs": len(photographs), "marks": digest_marks(photographs)}
+    return about | summarise_photographs(pd.concat(rows, ignore_index=True))
+
+
+def digest_marks(photographs: list[Photograph]) -> str:
+    """What tells marks from others: what was counted by other ones cannot be compared."""
+    told = [[p.path.name, p.xy.tolist(), p.size_px, p.share, p.askable] for p in photographs]
+    return hashlib.sha256(json.dumps(told).encode()).hexdigest()[:16]
 
 
 def check_name(name: str) -> None:
@@ -185,7 +196,7 @@ def ask_photographs(
 
 
 def score_answer(answer: Match, target: Photograph) -> pd.DataFrame:
-    """A row a query: from, and `MEASURES`, of an answer about a photograph."""
+    """A row a query: its photograph's from and file, and `MEASURES`."""
     size_px = target.size_px or target.share * max(answer.image1.shape[:2])
     rows, k = [], len(target.xy)
     for modes, best in zip(answer.modes, answer.best().xy, strict=True):
@@ -193,16 +204,30 @@ def score_answer(answer: Match, target: Photograph) -> pd.DataFrame:
         apart = np.linalg.norm(present[:, None] - target.xy[None], axis=-1) / size_px  # (n, k)
         near, nearest = apart.min(0), np.linalg.norm(target.xy - best, axis=1).min() / size_px
         found = [float((near < share).mean()) for share in (0.05, 0.1)]
-        rows.append([target.source, *found, float((apart[:k].min(1) > 0.1).mean()), 100 * float(nearest)])
-    return pd.DataFrame(rows, columns=["from", *MEASURES])
+        spurious = float((apart[:k].min(1) > 0.1).mean())
+        rows.append([target.source, str(target.path), *found, spurious, 100 * float(nearest)])
+    return pd.DataFrame(rows, columns=["from", "file", *MEASURES])
 
 
 def summarise_photographs(rows: pd.DataFrame) -> dict[str, Any]:
-    """{queries, unanswered, measures…} of all queries, and under "sources" of each source's photographs.
+    """{queries, unanswered, measures…} of all queries, "intervals", and under "sources" of each source's photographs.
 
-    ``unanswered``: share whose `Match.best` abstains.
+    ``unanswered``: share whose `Match.best` abstains. ``intervals``: `estimate_intervals`.
     """
-    return _summarise(rows) | {"sources": {str(name): _summarise(part) for name, part in rows.groupby("from")}}
+    sources = {str(name): _summarise(part) for name, part in rows.groupby("from")}
+    return _summarise(rows) | {"intervals": estimate_intervals(rows), "sources": sources}
+
+
+def estimate_intervals(rows: pd.DataFrame, *, seed: int = 0) -> dict[str, list[float] | None]:
+    """{measure: low and high of its mean's 95 % interval}, photographs drawn anew; None where nothing was answered."""
+    each = rows.groupby("file")[list(MEASURES)].agg(["sum", "count"])
+    drawn = np.random.default_rng(seed).integers(len(each), size=(DRAWS, len(each)))
+    intervals: dict[str, list[float] | None] = {}
+    for name in MEASURES:
+        total, count = (each[name][key].to_numpy()[drawn].sum(1) for key in ("sum", "count"))
+        means = total[count > 0] / count[count > 0]
+        intervals[name] = np.quantile(means, [0.025, 0.975]).round(4).tolist() if len(means) else None
+    return intervals
 
 
 def _summarise(rows: pd.DataFrame) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,14 @@ def find_regions(side: int = SIDE) -> dict[str, np.ndarray]:
     corner = (from_edge < CORNER).all(0)
     edge = (from_edge < BORDER).any(0) & ~corner
     return {"corner": corner, "edge": edge, "interior": (from_edge >= (side - INTERIOR) // 2).all(0)}
+
+
+def measure_rings(errors: Sequence[float | None]) -> list[float | None]:
+    """Mean of a cloth's 625 values by ring, from the border inwards; None of a ring without any."""
+    row, column = np.divmod(np.arange(SIDE * SIDE), SIDE)
+    ring = np.stack([np.minimum(v, SIDE - 1 - v) for v in (row, column)]).min(0)
+    means = pd.Series(np.array(errors, float)).groupby(ring).mean()
+    return [None if np.isnan(mean) else round(float(mean), 2) for mean in means]
 
 
 def summarise_regions(queries: pd.DataFrame) -> dict[str, dict[str, float]]:

@@ -3,12 +3,15 @@
     python -m mmgsd.measure.shipped cloth cloth-paper daisy --photographs FOLDER    -> data/results/shipped.json
     python -m mmgsd.measure.shipped cloth@1,1 --photographs FOLDER     its modes read with another power and sharpness
     python -m mmgsd.measure.shipped robustness --photographs FOLDER    the models of that study, once they are trained
+    python -m mmgsd.measure.shipped cloth --cloth-renders FOLDER       and others' renders of a cloth
 
 A row a name: of weights in data/weights; of a baseline, which is asked about each object with the true masks, and in
-photographs with those that the shipped weights see; or of each model of a study of `STUDIES` of the preset `paper`,
-or of another with so many steps each (--preset quick --steps 300), which is asked about that preset's images. How modes
-are read (`mmgsd.match.mixture.Reading`) is the weights' own, unless the name says another after an @. The test images
-of the presets `SETS`, or of that one, have to be rendered. Tables of answers are kept, so that a killed call goes on.
+photographs with those that the shipped weights see, and whose modes are read as theirs; or of each model of a study of
+`STUDIES` of the preset `paper`, or of another with so many steps each (--preset quick --steps 300), which is asked
+about that preset's images. How modes are read (`mmgsd.match.mixture.Reading`) is the weights' own, unless the name says
+another after an @. The test images of the presets `SETS`, or of that one, have to be rendered, unless
+--photographs-alone leaves them out: what a row has of the same weights stays. Tables of answers are kept, so that a
+killed call goes on.
 """
 
 from __future__ import annotations
@@ -18,7 +21,7 @@ import dataclasses
 import hashlib
 import statistics
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +41,8 @@ from mmgsd.match.baselines import BASELINES, BaselineMatcher, FeatureMatcher
 from mmgsd.match.calibration import Calibration
 from mmgsd.match.match import RADIUS_PX, Match
 from mmgsd.match.matcher import Matcher, find_weights
-from mmgsd.match.mixture import Reading
+from mmgsd.match.mixture import AS_IT_IS, Reading
+from mmgsd.measure.cloth_renders import measure_cloth_renders
 from mmgsd.measure.evaluation import evaluate_baseline, evaluate_model, load_queries, read_results
 from mmgsd.measure.figure_data import PLAIN
 from mmgsd.measure.heads import MEASURES as HEADS
@@ -65,21 +69,22 @@ RESULTS = "shipped.json"
 
 def measure_weights(
     name: str, root: Path, *, weights: Path | None = None, photographs: Path | None = None,
-    presets: Sequence[str] = SETS, progress: bool = True,
+    cloth_renders: Path | None = None, presets: Sequence[str] = SETS, progress: bool = True,
 ) -> dict[str, Any]:  # fmt: skip
     """The row of ``weights``, or of shipped ones: a dictionary a set of `SETS`, ``photographs``, ``milliseconds``.
 
     Of a set: `mmgsd.measure.metrics.aggregate` over visible sources, `summarise_uncertainty` by the weights' own
     calibration, its ``reliability`` beside a Gaussian's, ``within_radius``, the share of modes with a true match within
     `Match.radius_px` (level 0.9), and ``heads`` (`measure_heads`). ``milliseconds``: of one question about two images.
-    ``presets`` are those whose images stand for `SETS`.
+    ``presets`` are those whose images stand for `SETS`; without any, neither they nor the time are measured.
+    ``cloth_renders`` of a cloth's weights: `mmgsd.measure.cloth_renders.measure_cloth_renders`.
     """
     file = weights or find_weights(name)
     matcher = Matcher.load(file)
     row = {"object": matcher.object, "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
            "calibrated": matcher.calibration is not None, "power": matcher.reading.power,
            "sharpness": matcher.reading.sharpness}  # fmt: skip
-    for kind, preset in zip(SETS, presets, strict=True):
+    for kind, preset in zip(SETS, presets, strict=bool(presets)):
         paths = Paths(root, preset)
         data, config = paths.dataset(matcher.object), load_preset(preset).evaluate
         table = evaluate_model(file, data, config, paths.queries(f"shipped-{name}"), progress=progress)
@@ -88,16 +93,19 @@ def measure_weights(
         row[kind] = _summarise(table, matcher) | {"heads": {key: read_json(heads)[key] for key in HEADS}}
     if photographs:
         row["photographs"] = measure_photographs(file, photographs, progress=progress)
-    return row | _time_question(matcher, root)
+    if cloth_renders and matcher.object == "cloth":
+        row["cloth_renders"] = measure_cloth_renders(matcher, cloth_renders)
+    return row | (_time_question(matcher, root) if presets else {})
 
 
 def measure_read(
-    name: str, root: Path, *, photographs: Path | None = None, presets: Sequence[str] = SETS, progress: bool = True
-) -> dict[str, Any]:
+    name: str, root: Path, *, photographs: Path | None = None, cloth_renders: Path | None = None,
+    presets: Sequence[str] = SETS, progress: bool = True,
+) -> dict[str, Any]:  # fmt: skip
     """The row of shipped weights whose modes are read otherwise: "cloth@1,1" with power 1 and sharpness 1, at means.
 
-    `mmgsd.measure.metrics.aggregate` over visible sources of each of ``presets``, and photographs. ValueError for other
-    numbers, FileNotFoundError for other weights.
+    `mmgsd.measure.metrics.aggregate` over visible sources of each of ``presets``, photographs and others' renders.
+    ValueError for other numbers, FileNotFoundError for other weights.
     """
     weights, _, numbers = name.partition("@")
     file = find_weights(weights)
@@ -113,7 +121,15 @@ def measure_read(
         row[preset] = aggregate(queries[queries.visible])
     if photographs:
         row["photographs"] = measure_answers(matcher, read_photographs(photographs, matcher.object), progress=progress)
+    if cloth_renders and matcher.object == "cloth":
+        row["cloth_renders"] = measure_cloth_renders(matcher, cloth_renders)
     return row
+
+
+def name_read(name: str, row: Mapping[str, Any]) -> str:
+    """What a row read with its power and sharpness is called: "cloth-daisy@1,6"; at means, by its name alone."""
+    power, sharpness = row["power"], row["sharpness"]
+    return name if power == sharpness == 1 else f"{name}@{power:g},{sharpness:g}"
 
 
 def parse_reading(text: str, like: Reading) -> Reading:
@@ -178,19 +194,25 @@ class Masked:
 
 
 def measure_baseline(
-    method: str, object: str, root: Path, *, photographs: Path | None = None, progress: bool = True
-) -> dict[str, Any]:
-    """The row of a baseline: `mmgsd.measure.metrics.aggregate` over visible sources of each of `SETS`, photographs."""
-    row: dict[str, Any] = {"object": object}
-    for preset in SETS:
+    method: str, object: str, root: Path, *, photographs: Path | None = None, presets: Sequence[str] = SETS,
+    progress: bool = True,
+) -> dict[str, Any]:  # fmt: skip
+    """The row of a baseline: `mmgsd.measure.metrics.aggregate` over visible sources of each preset, photographs.
+
+    Its modes are read as the shipped weights of the object are.
+    """
+    segmenter = Matcher.load(find_weights(object))
+    power, sharpness = segmenter.reading.power, segmenter.reading.sharpness
+    reading = dataclasses.replace(AS_IT_IS, power=power, sharpness=sharpness)
+    row: dict[str, Any] = {"object": object, "power": power, "sharpness": sharpness}
+    for preset in presets:
         paths = Paths(root, preset)
-        out = paths.queries(f"{object}-{method}")
+        out = paths.queries(name_read(f"{object}-{method}", row))
         queries = load_queries(evaluate_baseline(method, paths.dataset(object), load_preset(preset).evaluate, out,
-                                                 progress=progress))  # fmt: skip
+                                                 reading=reading, progress=progress))  # fmt: skip
         row[preset] = aggregate(queries[queries.visible])
     if photographs:
-        segmenter = Matcher.load(find_weights(object))
-        masked = Masked(BaselineMatcher(method), segmenter, modes=segmenter.modes)
+        masked = Masked(BaselineMatcher(method, reading=reading), segmenter, modes=segmenter.modes)
         row["photographs"] = measure_answers(masked, read_photographs(photographs, object), progress=progress)
     return row
 
@@ -225,15 +247,15 @@ def measure_study(
 
 def _measure(name: str, root: Path, args: argparse.Namespace) -> dict[str, dict[str, Any]]:
     """The rows of a name that is asked for."""
-    how = {"photographs": args.photographs}
+    if name in STUDIES:
+        how = {"objects": (args.object,) if args.object else (), "steps": args.steps, "photographs": args.photographs}
+        return measure_study(name, root, load_preset(args.preset), **how)
+    how = {"photographs": args.photographs, "presets": () if args.photographs_alone else SETS}
     if name in BASELINES:
-        return {f"{object}-{name}": measure_baseline(name, object, root, **how) for object in OBJECTS}
-    if "@" in name:
-        return {name: measure_read(name, root, presets=() if args.photographs_alone else SETS, **how)}
-    if name not in STUDIES:
-        return {name: measure_weights(name, root, **how)}
-    objects = (args.object,) if args.object else ()
-    return measure_study(name, root, load_preset(args.preset), objects=objects, steps=args.steps, **how)
+        rows = {f"{object}-{name}": measure_baseline(name, object, root, **how) for object in OBJECTS}
+        return {name_read(key, row): row for key, row in rows.items()}
+    measure = measure_read if "@" in name else measure_weights
+    return {name: measure(name, root, cloth_renders=args.cloth_renders, **how)}
 
 
 def main() -> None:
@@ -247,8 +269,9 @@ def main() -> None:
     )
     parser.add_argument("--photographs", type=Path, metavar="FOLDER", help="marked photographs, with index.json")
     parser.add_argument(
-        "--photographs-alone", action="store_true", help="of names with an @, leave the renders out: they take longest"
+        "--photographs-alone", action="store_true", help="leave the presets' test images out: they take longest"
     )
+    parser.add_argument("--cloth-renders", type=Path, metavar="FOLDER", help="others' renders, with knots_info.json")
     parser.add_argument("--preset", default=SETS[0], choices=tuple(PRESETS), help=f"of the study (default: {SETS[0]})")
     parser.add_argument("--steps", type=int, default=0, help="of each model of a study (default: the study's own)")
     parser.add_argument("--object", default="", choices=OBJECTS, help="of a study's models those of one object")
@@ -260,8 +283,7 @@ def main() -> None:
         kept = read_results(out)
         for key, row in rows.items():  # photographs are not at everybody's hand: a call without them keeps the row's
             before = kept.get(key, {})
-            parts = ("photographs", *SETS) if before.get("sha256") == row.get("sha256") else ()
-            kept[key] = {part: before[part] for part in parts if part in before} | row
+            kept[key] = (before if before.get("sha256") == row.get("sha256") else {}) | row
         print(f"{write_json(out, kept)}: {', '.join(rows)}")
 
 

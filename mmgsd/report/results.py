@@ -8,14 +8,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.signal import find_peaks
 
 from mmgsd.config import N_POINTS, OBJECTS
 from mmgsd.files import DamagedFileError, read_json
-from mmgsd.measure.regions import MAP
+from mmgsd.measure.regions import MAP, measure_rings
 
 REMEDY = "restore it (it may be in git), or run its notebook again with run=True"
 PAPER = {"cloth": 32.4, "rope": 31.3}  # px, MMGSD's RMSE as the paper reports it
-FILES = ("rmse", "runs", "budget", "sigma", "uncertainty", "symmetry", "broken_symmetry", "errors", "seeds_1000")
+FILES = (
+    "rmse", "runs", "budget", "sigma", "uncertainty", "symmetry", "broken_symmetry", "errors", "seeds_1000", "entropy",
+    "continuity", "grasp",
+)  # fmt: skip
+PEAK = 0.05  # of a density's greatest value, by which a peak must stand out
 ENDS = 0.1  # of a rope's length at each end, its extremities; the middle is the fifth around its centre
 
 
@@ -37,20 +42,23 @@ def told_where(path: Path) -> Iterator[None]:
 
 
 def load_results(folder: Path) -> dict[str, Any]:
-    """{name: content} of the results files that are there; ``folding`` in short, ``places`` from the figures' data.
+    """{name: content} of the results files that are there; ``folding`` in short; ``places``, ``peaks`` of figures.
 
-    Without the symmetry study's maps, which are for its figure.
+    The symmetry study's maps, which are for its figure, come as ``rings``.
     """
     files = {name: folder / f"{name}.json" for name in FILES}
     results = {name: read_table(path) for name, path in files.items() if path.is_file()}
     with told_where(files["symmetry"]):
         for row in results.get("symmetry", {}).values():
-            row.pop(MAP, None)
+            if MAP in row:
+                row["rings"] = measure_rings(row.pop(MAP))
     drawn = {name: folder / f"figures_{name}.safetensors" for name in OBJECTS}
-    places = {name: measure_places(path, name) for name, path in drawn.items() if path.is_file()}
+    drawn = {name: path for name, path in drawn.items() if path.is_file()}
+    places = {name: measure_places(path, name) for name, path in drawn.items()}
+    peaks = {name: count_peaks(path) for name, path in drawn.items()}
     rollouts = folder / "folding.json"
     folding = {"folding": read_folding(rollouts)} if rollouts.is_file() else {}
-    return results | folding | ({"places": places} if places else {})
+    return results | folding | ({"places": places, "peaks": peaks} if drawn else {})
 
 
 def read_folding(path: Path) -> dict[str, dict[str, Any]]:
@@ -59,6 +67,17 @@ def read_folding(path: Path) -> dict[str, dict[str, Any]]:
         return {object: {name: {**row["reachable"], "beyond": row["beyond"]}
                          for name, row in policies.items() if "reachable" in row and "beyond" in row}
                 for object, policies in read_table(path)["policies"].items()}  # fmt: skip
+
+
+def count_peaks(path: Path) -> int:
+    """How many peaks the distribution of MMGSD's error has, as it is drawn (`mmgsd.figures.plots.plot_rmse_pdf`)."""
+    from mmgsd.figures.plots import compute_density  # with matplotlib: only where it is needed
+    from mmgsd.measure.figure_data import load_figure_data
+    from mmgsd.measure.metrics import BIN_PX
+
+    data = load_figure_data(path)
+    _, density = compute_density(data.errors["mmgsd"].histogram, 100 * BIN_PX / data.object_size_px)
+    return len(find_peaks(np.pad(density, 1), prominence=PEAK * density.max())[0])
 
 
 def measure_places(path: Path, name: str) -> dict[str, float]:

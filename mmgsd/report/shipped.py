@@ -6,12 +6,14 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from mmgsd.config import OBJECTS, load_preset
-from mmgsd.experiments import ROWS, get_label
+from mmgsd.experiments import ROWS, SHIPPED, get_label
 from mmgsd.match.baselines import BASELINES
+from mmgsd.report.results import PAPER
 
 Rows = Mapping[str, Mapping[str, Any]]  # data/results/shipped.json, {name: what `mmgsd.measure.shipped` found}
 SETS = {"paper": "clean", "workspace": "cluttered"}  # test images: what readers know them as
 SIDES = {"cloth": "side", "rope": "length"}  # of what an error is a share
+READING = ("power", "sharpness")
 SOURCES = """\
 The photographs, counted as on the
 [results page](data/results/README.md#is-it-right-about-clutter-and-photographs), are from {sources}."""
@@ -19,15 +21,31 @@ COUNTS = "Photographs: {counts}. One question about two new images takes {slowes
 
 
 def list_names(rows: Rows, object: str) -> list[str]:
-    """The rows of an object: weights for everything, those of the paper's images, then baselines."""
+    """The rows of an object: weights for everything, those of the paper's images, then baselines; all read alike."""
     order = [object, f"{object}-paper", *(f"{object}-{name}" for name in BASELINES)]
-    return [name for name in order if name in rows]
+    return [found for name in order if (found := find_alike(rows, name)) in rows]
+
+
+def find_alike(rows: Rows, name: str) -> str:
+    """The row of a name whose modes are read as the object's shipped weights are: its own, or one read so."""
+    like = rows.get(name.partition("-")[0], {})
+    reading = [like.get(key) for key in READING]
+    if None in reading or [rows.get(name, {}).get(key) for key in READING] == reading:
+        return name
+    return f"{name}@{','.join(f'{value:g}' for value in reading)}"
 
 
 def label_row(name: str) -> str:
     """What tables and figures call a row: weights by the name that loads them."""
-    kind = name.partition("-")[2]
-    return get_label(kind) if kind in BASELINES else f"`{name}`"
+    weights = name.partition("@")[0]
+    kind = weights.partition("-")[2]
+    return get_label(kind) if kind in BASELINES else f"`{weights}`"
+
+
+def get_photographs(rows: Rows, name: str) -> Mapping[str, Any]:
+    """What a row found in photographs; nothing where it counted other marks than the object's shipped weights did."""
+    found, like = (rows.get(key, {}).get("photographs", {}) for key in (name, name.partition("@")[0].partition("-")[0]))
+    return found if found.get("marks") == like.get("marks") else {}
 
 
 def make_limits_table(rows: Rows) -> str:
@@ -60,16 +78,54 @@ def make_pictures_table(rows: Rows) -> str:
 
 
 def _make_pictures_lines(rows: Rows, labels: Mapping[str, str]) -> str:
-    heads = ["", *(f"{word}: RMSE px" for word in SETS.values()), "photographs: found", "spurious", "best"]
+    found = "photographs: found", "spurious", "not answered", "best of the rest"
+    found = found if any(get_photographs(rows, name) for name in labels) else ()
+    heads = ["", *(f"{word}: RMSE px" for word in SETS.values()), *found]
     lines = [_join(heads), "|---" * len(heads) + "|"]
     for name, label in labels.items():
         errors = [_format(rows[name].get(preset), "rmse_mean", 1, ".1f") for preset in SETS]
-        photographs = rows[name].get("photographs")
-        shares = [_format(photographs, key, 100, ".0f", " %") for key in ("found@5%", "spurious")]
+        photographs = get_photographs(rows, name)
+        shares = [_say_interval(photographs, key) for key in ("found@5%", "spurious")]
+        unanswered = _format(photographs, "unanswered", 100, ".0f", " %")
         best = _format(photographs, "best", 1, ".1f", " %")
         object = name.partition("@")[0].partition("-")[0]
-        lines.append(_join([f"{object}, {label}", *errors, *shares, best]))
+        cells = [f"{object}, {label}", *errors, *shares, unanswered, best]
+        lines.append(_join(cells[: len(heads)]))
     return "\n".join(lines)
+
+
+def _say_interval(photographs: Mapping[str, Any], key: str) -> str:
+    """A share with its 95 % interval, where that is known."""
+    low_high = (photographs.get("intervals") or {}).get(key)
+    interval = " ({:.0f} to {:.0f})".format(*(100 * value for value in low_high)) if low_high else ""
+    return _format(photographs, key, 100, ".0f", " %") + interval
+
+
+def make_reading_sentence(rows: Rows) -> str:
+    """How all of `make_pictures_table` are read, and whether intervals of what two weights find overlap."""
+    said = [f"power {rows[object]['power']:g}, sharpness {rows[object]['sharpness']:g} ({object})"
+            for object in OBJECTS]  # fmt: skip
+    apart = [f"those of `{object}` and `{object}-paper` {_tell_apart(rows, object)}" for object in OBJECTS]
+    return f"All are read with {' or '.join(said)}. 95 % intervals by photographs: {', '.join(apart)}."
+
+
+def _tell_apart(rows: Rows, object: str) -> str:
+    found = [get_photographs(rows, name) for name in (object, find_alike(rows, f"{object}-paper"))]
+    intervals = [(photographs.get("intervals") or {}).get("found@5%") for photographs in found]
+    if None in intervals:
+        return "are not compared"
+    (low, high), (other_low, other_high) = intervals
+    return "overlap" if low <= other_high and other_low <= high else "do not overlap"
+
+
+def make_cloth_renders_table(rows: Rows) -> str:
+    """Markdown of the errors on others' renders of a cloth, a row the weights, and what the paper says of its own."""
+    lines = ["|  | RMSE px | median px | pck@20px |", "|---" * 4 + "|"]
+    for name in (find_alike(rows, f"cloth{kind}") for kind in SHIPPED.values()):
+        if found := rows.get(name, {}).get("cloth_renders"):
+            cells = [_format(found, key, 1, ".1f") for key in ("rmse_mean", "median")]
+            lines.append(_join([label_row(name), *cells, _format(found, "pck@20px", 100, ".0f", " %")]))
+    return "\n".join([*lines, f"| *the paper's MMGSD, on images like its training's* | *{PAPER['cloth']}* | – | – |"])
 
 
 def make_parts_table(rows: Rows) -> str:
@@ -85,8 +141,8 @@ def make_readings_table(rows: Rows) -> str:
     for name in (name for name in sorted(rows) if "power" in rows[name]):
         weights, _, numbers = name.partition("@")
         again = any(other.startswith(f"{weights}@") for other in rows)
-        if numbers or again:
-            row = rows[name]
+        row = rows[name]
+        if (numbers or again) and {"photographs", *SETS} & row.keys():
             labels[name] = f"`{weights}`, power {row['power']:g}, sharpness {row['sharpness']:g}"
     return _make_pictures_lines(rows, labels)
 
@@ -106,7 +162,7 @@ def make_knowledge_table(rows: Rows) -> str:
                 "within the 90 % radius": "within_radius"}  # fmt: skip
     lines = [_join(["", *measures]), "|---" * (len(measures) + 1) + "|"]
     for object in OBJECTS:
-        for name in (name for name in list_names(rows, object) if "calibrated" in rows[name]):
+        for name in (name for name in (object, f"{object}-paper") if "calibrated" in rows.get(name, {})):
             for preset, word in SETS.items():
                 found = rows[name].get(preset, {})
                 found = {**found, **found.get("heads", {})}

@@ -13,17 +13,19 @@ from mmgsd.command import run_command
 from mmgsd.files import write_text
 from mmgsd.report import descriptions as described
 from mmgsd.report.findings import describe_claims, make_findings
-from mmgsd.report.folding import make_folding_sentence, make_folding_table
+from mmgsd.report.folding import make_folding_sentence, make_folding_table, make_grasp_table, make_starts_table
 from mmgsd.report.joint import make_joint_sentence, make_joint_table
 from mmgsd.report.results import load_results, read_table, told_where
 from mmgsd.report.shipped import (
     make_budget_sentence,
     make_by_source_table,
+    make_cloth_renders_table,
     make_counts_sentence,
     make_knowledge_table,
     make_limits_table,
     make_parts_table,
     make_pictures_table,
+    make_reading_sentence,
     make_readings_table,
     make_sources_sentence,
 )
@@ -93,11 +95,14 @@ TABLES: dict[str, tuple[str | tuple[str, ...], Callable[[Any], described.Table |
     "symmetry": ("paper/symmetry.json", described.describe_symmetry),
     "fixes": ("paper/broken_symmetry.json", described.describe_fixes),
     "seeds_1000": ("paper/seeds_1000.json", described.describe_seeds),
+    "first_seed": ("paper/seeds_1000.json", described.make_first_seed_sentence),
     "quick": ("quick/rmse.json", described.describe_main),
     "seeds_quick": ("quick/seeds.json", described.describe_seeds),
     "uncertainty": ("paper/uncertainty.json", described.describe_uncertainty),
     "folding": ("paper/folding.json", make_folding_table),
     "folding_counts": ("paper/folding.json", make_folding_sentence),
+    "folding_starts": ("paper/folding.json", make_starts_table),
+    "grasp": ("paper", make_grasp_table),
     "joint": ("joint.json", make_joint_table),
     "joint_counts": ("joint.json", make_joint_sentence),
     "limits": ("shipped.json", make_limits_table),
@@ -109,6 +114,8 @@ TABLES: dict[str, tuple[str | tuple[str, ...], Callable[[Any], described.Table |
     "sources": ("shipped.json", make_sources_sentence),
     "by_source": ("shipped.json", make_by_source_table),
     "counts": ("shipped.json", make_counts_sentence),
+    "alike": ("shipped.json", make_reading_sentence),
+    "cloth_renders": ("shipped.json", make_cloth_renders_table),
 }
 
 

@@ -17,6 +17,7 @@ from mmgsd.figures.errors import (
     plot_error_analysis,
     plot_worst,
     plot_worst_queries,
+    summarise_entropy,
     summarise_states,
 )
 from mmgsd.match.match import Match
@@ -68,6 +69,12 @@ def test_states_are_averaged() -> None:
     assert summarise_states(table)["b"].to_dict() == {"a": 2.0, "b": 7.0}
 
 
+def test_entropy_is_told_by_what_is_hidden_and_by_state() -> None:
+    table = pd.DataFrame({"hidden": [0, 0, 2], "state1": ["straight", "overhand knot", "overhand knot"],
+                          "entropy": [8.0, 9.0, 11.0]})  # fmt: skip
+    assert summarise_entropy(table) == {"seen": 8.5, "hidden": 11.0, "overhand knot": 10.0, "straight": 8.0}
+
+
 def test_figures_show_every_object_and_query(data: Dataset) -> None:
     described = describe_queries(make_queries([0, 30, 312, 400]), data)
     figure = plot_error_analysis({"cloth": described})
@@ -80,6 +87,7 @@ def test_figures_show_every_object_and_query(data: Dataset) -> None:
                   np.zeros(1), np.zeros(1), np.ones((1, 8, 8)) / 64)  # fmt: skip
     figure = plot_worst([match] * 3, [mode[0]] * 3, [1.0, 2.0, 3.0])
     assert [axis.get_title() for axis in figure.axes] == ["1 px", "2 px", "3 px"]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["asked pixel", "mode", "true match"]
 
 
 def test_states_of_enough_pairs_have_no_brackets_and_absent_ones_no_number(data: Dataset) -> None:

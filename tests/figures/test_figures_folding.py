@@ -12,6 +12,7 @@ from mmgsd.figures.folding import (
     THUMBNAIL_PX,
     crop_square,
     mark_moves,
+    mark_success,
     plot_moves,
     plot_rollouts,
     plot_success,
@@ -42,6 +43,13 @@ def test_the_middle_square_is_shown() -> None:
     picture[:, 8:56] = 255
     cropped = crop_square(picture)
     assert cropped.shape == (THUMBNAIL_PX, THUMBNAIL_PX, 3) and cropped.min() == 255
+
+
+@pytest.mark.parametrize(("success", "colour"), [(True, 1), (False, 0)])
+def test_a_frame_says_whether_it_is_a_success(success: bool, colour: int) -> None:
+    framed = mark_success(PICTURE, success)
+    assert framed.shape == (THUMBNAIL_PX, THUMBNAIL_PX, 3) and not framed[80, 80].any()
+    assert framed[80, 1].argmax() == colour and not PICTURE.any()
 
 
 def test_moves_are_arrows_from_pick_to_place() -> None:

@@ -22,6 +22,14 @@ def test_bars_are_what_was_measured() -> None:
     ]  # fmt: skip
 
 
+def test_bars_are_of_one_reading() -> None:
+    own = {"power": 1.0, "sharpness": 6.0}
+    alike = {"cloth-paper@1,6": own | {"photographs": {"found@5%": 0.64}}}
+    figure = plot_robustness(ROWS | {"cloth": ROWS["cloth"] | own} | alike)
+    widths = [[round(bar.get_width(), 6) for bar in axis.patches] for axis in figure.axes]
+    assert widths == [[20, 70], [30], [60, 64]]  # on renders cloth-paper was read otherwise
+
+
 def test_errors_share_an_axis_from_zero() -> None:
     limits = [axis.get_xlim() for axis in plot_robustness(ROWS).axes]
     assert limits[0] == limits[1] and limits[0][0] == 0 and limits[0][1] > 90 and limits[2] == (0, 100)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mmgsd.fold.measures import compare_rollouts, estimate_mean, measure_outcome, measure_overlap
+from mmgsd.fold.measures import compare_rollouts, estimate_mean, estimate_share, measure_outcome, measure_overlap
 from mmgsd.symmetry import grid_group, line_group
 
 ROW, COLUMN = np.divmod(np.arange(625), 25)
@@ -57,6 +57,13 @@ def test_intervals_hold_the_mean_and_shrink_with_more(rng: np.random.Generator) 
         few["low"] < few["mean"] < few["high"] and many["high"] - many["low"] < 0.2 * (few["high"] - few["low"]) + 0.1
     )
     assert estimate_mean(np.zeros(0)) == {"mean": None, "low": None, "high": None, "count": 0}
+
+
+@pytest.mark.parametrize(("found", "low", "high"), [(0, 0.0, 0.0653), (55, 0.9347, 1.0), (49, 0.7817, 0.9493)])
+def test_none_and_all_have_an_interval(found: int, low: float, high: float) -> None:
+    said = estimate_share([True] * found + [False] * (55 - found))
+    assert (said["low"], said["high"]) == pytest.approx((low, high), abs=1e-3) and said["count"] == 55
+    assert estimate_share([])["mean"] is None
 
 
 def test_a_comparison_is_of_the_same_rollouts() -> None:

@@ -13,7 +13,7 @@ from mmgsd.fold import policies, rollouts
 from mmgsd.fold.demonstration import Look, read_demonstration
 from mmgsd.fold.moves import Answer
 from mmgsd.fold.policies import POLICIES, SHIPPED, digest_policy, find_answering
-from mmgsd.fold.rollouts import find_on_table, list_rollouts, run_folding, summarise_rollouts
+from mmgsd.fold.rollouts import choose_shown, find_on_table, list_rollouts, run_folding, summarise_rollouts
 from mmgsd.fold.tasks import GROUNDS, TASKS
 from mmgsd.report.results import load_results
 from mmgsd.scene.state import State, read_state, write_state
@@ -64,18 +64,19 @@ def physics(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 def test_rollouts_go_through_tasks_starts_and_grounds_in_turn() -> None:
     found = list_rollouts("cloth", 40)
-    assert len({rollout.name for rollout in found}) == 40
+    assert len({rollout.name for rollout in found}) == 56 and len(list_rollouts("rope", 40)) == 40
+    assert {rollout.start for rollout in found[40:]} == {"wrinkled"} and len({r.task for r in found[40:]}) == 4
     assert {rollout.task for rollout in found} == {name for name, task in TASKS.items() if task.object == "cloth"}
     assert {rollout.ground for rollout in found} == set(GROUNDS)
     assert all(rollout.start in TASKS[rollout.task].starts for rollout in found)
-    assert list_rollouts("cloth", 10) == found[:10]
+    assert list_rollouts("cloth", 10)[:10] == found[:10]
 
 
 def test_a_run_makes_every_state_once_and_a_second_none(tmp_path: Path, physics: list[str]) -> None:
     out = run_folding("smoke", tmp_path, policies=ASKED, progress=False)
     results = json.loads(out.read_text())
     assert results["run"]["rollouts"] == 2
-    assert list(results["policies"]["cloth"]) == ["truth", "random"]
+    assert list(results["policies"]["cloth"]) == ["truth", "random", "nothing"]
     assert results["policies"]["cloth"]["truth"]["all"]["error"]["count"] == 2
     assert len(physics) == len(set(physics)) and any(name.startswith("random-edge") for name in physics)
     count = len(physics)
@@ -97,6 +98,7 @@ def test_an_interrupted_run_goes_on_from_its_files(tmp_path: Path, physics: list
 def test_a_rollout_that_is_a_success_untouched_does_not_count(tmp_path: Path, physics: list[str]) -> None:
     results = json.loads(run_folding("smoke", tmp_path, policies=ASKED, progress=False).read_text())
     rows = results["policies"]["cloth"]  # nothing moves, and the demonstration's end is its start
+    assert rows["nothing"]["all"]["success"]["mean"] == 1
     assert rows["truth"]["all"]["success"]["mean"] == 1 and "reachable" not in rows["truth"]
 
 
@@ -112,7 +114,18 @@ def test_slides_show_each_look_and_the_end(tmp_path: Path, physics: list[str]) -
     bench = rollouts.Bench(tmp_path, {"progress": False})
     kept = [rollout for rollout in list_rollouts("cloth", 8) if rollout.task in ("edge", "twice")]
     bench.roll(ASKED[:1], kept, bench.make_starts(kept))
-    assert len(bench.list_slides(ASKED[0], kept)) == 2 + 3
+    shown = choose_shown(kept, {})
+    assert len(bench.list_slides(ASKED[0], shown)) == 2 + 3
+
+
+def test_the_rollout_with_the_median_error_is_drawn() -> None:
+    kept = [rollout for rollout in list_rollouts("cloth", 27) if rollout.task in ("edge", "unfold")]
+    ended = {rollout.name: {"error": abs(k - 2.0)} for k, rollout in enumerate(kept)}
+    shown = choose_shown(kept, ended)
+    assert list(shown) == ["edge", "unfold"]
+    for task, rollout in shown.items():
+        errors = sorted(ended[r.name]["error"] for r in kept if r.task == task)
+        assert ended[rollout.name]["error"] == errors[len(errors) // 2]
 
 
 def test_demonstrations_are_written_as_a_users_are_read(tmp_path: Path, physics: list[str]) -> None:
@@ -127,7 +140,7 @@ def test_demonstrations_are_written_as_a_users_are_read(tmp_path: Path, physics:
 def test_rows_of_other_policies_stay(tmp_path: Path, physics: list[str]) -> None:
     run_folding("smoke", tmp_path, policies=ASKED, progress=False)
     results = json.loads(run_folding("smoke", tmp_path, policies=ASKED[:1], progress=False).read_text())
-    assert list(results["policies"]["rope"]) == ["truth", "random"]
+    assert list(results["policies"]["rope"]) == ["truth", "random", "nothing"]
 
 
 def test_a_model_that_is_not_trained_yet_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -165,7 +178,7 @@ def test_all_methods_are_asked_for_as_many_modes_but_one(
 
 
 @pytest.mark.parametrize(("words", "names"), [
-    ([], {"truth", "mmgsd", "spcl", "random"}),
+    ([], {"truth", "mmgsd", "mmgsd_paper", "spcl", "random"}),
     (["--trained"], {"truth", "quick_mmgsd", "quick_unimodal"}),
     (["--trained", "--only", "pcl"], {"truth", "quick_spcl", "quick_pcl"}),
 ])  # fmt: skip
@@ -176,7 +189,8 @@ def test_the_command_runs_shipped_weights_or_trained_models(
     monkeypatch.setattr(rollouts, "run_folding", lambda *_, policies, **__: asked.append({p.name for p in policies}))
     monkeypatch.setattr("sys.argv", ["rollouts", "smoke", *words])
     rollouts.main()
-    assert names <= asked[0] and any("quick" in name for name in asked[0]) == ("--trained" in words)
+    assert names <= asked[0] and "nothing" not in asked[0]
+    assert any("quick" in name for name in asked[0]) == ("--trained" in words)
 
 
 def test_another_preset_has_no_rollouts(tmp_path: Path) -> None:

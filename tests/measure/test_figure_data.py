@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -94,7 +95,12 @@ def test_the_matches_of_every_query_are_kept_and_old_files_have_the_first(gather
 def gathered(cloth_dataset: Path, monkeypatch: pytest.MonkeyPatch) -> FigureData:
     """Figure data of two methods, one of them a model."""
     monkeypatch.setattr(Matcher, "load", lambda path: Matcher.__new__(Matcher))
-    monkeypatch.setattr(Matcher, "match", answer_by_rote)
+
+    def match(*asked: Any, n: list[int]) -> Match:
+        assert n == [4, 4]  # of every method, whatever it was taught
+        return answer_by_rote(*asked)
+
+    monkeypatch.setattr(Matcher, "match", match)
     queries = QUERIES.assign(image0=0, image1=2)
     tables = {"mmgsd": queries, "sift": queries.assign(rmse_px=7.3)}
     return gather_figure_data(tables, {"mmgsd": Path("any")}, load_dataset(cloth_dataset, "test"), points=[3, 7])

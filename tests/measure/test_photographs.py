@@ -21,6 +21,7 @@ from mmgsd.measure import photographs
 from mmgsd.measure.photographs import (
     ask_photographs,
     describe_marks,
+    digest_marks,
     make_photographs_table,
     mark_dataset,
     measure_photographs,
@@ -97,6 +98,7 @@ def test_what_is_found_by_hand(folder: Path) -> None:
     (row,) = score_answer(answer_with(modes), flat).to_dict("records")
     assert row == {
         "from": "some/where",
+        "file": str(flat.path),
         "found@5%": 2 / 4,  # 4, 8, 15 and 1 px from the corners
         "found@10%": 3 / 4,
         "spurious": 1 / 4,  # of the four first that are there
@@ -119,6 +121,24 @@ def test_an_answer_that_abstains_counts_as_unanswered_and_not_in_best(folder: Pa
     summary = summarise_photographs(rows)
     assert (summary["queries"], summary["unanswered"], summary["best"]) == (2, 0.5, 0.0)
     assert summarise_photographs(score_answer(silent, flat))["best"] is None
+
+
+def test_intervals_are_over_photographs_with_all_their_queries() -> None:
+    rows = pd.DataFrame({"from": "a", "file": ["1"] * 90 + ["2"] * 10, "found@5%": [1.0] * 90 + [0.0] * 10})
+    rows = rows.assign(**{"found@10%": 1.0, "spurious": 0.0, "best": np.nan})
+    intervals = summarise_photographs(rows)["intervals"]
+    assert intervals["found@5%"] == [0, 1]  # two photographs, whatever their hundred queries say
+    assert intervals["found@10%"] == [1, 1] and intervals["best"] is None
+
+
+def test_other_marks_are_told_from_these(folder: Path) -> None:
+    before = digest_marks(read_photographs(folder, "cloth"))
+    entries = json.loads((folder / "index.json").read_text())
+    write_index(folder, [{**entry, "note": "more"} for entry in entries])
+    assert digest_marks(read_photographs(folder, "cloth")) == before
+    entries[0]["corners"][0] = [21, 20]
+    write_index(folder, entries)
+    assert digest_marks(read_photographs(folder, "cloth")) != before
 
 
 def test_flat_cloths_are_asked_about_in_every_other_photograph(folder: Path) -> None:
@@ -145,6 +165,7 @@ def test_flat_cloths_are_asked_about_in_every_other_photograph(folder: Path) -> 
         ({"corners": [None] * 4, "visible_corner_stickers": [[1, 2]]}, 1, False, 0.65 * 160),
         ({"corners": SQUARE.tolist(), "visible_corner_stickers": [[1, 2]]}, 4, True, 100),
         ({"visible_corners_unordered": [[1, 2], [3, 4]]}, 2, False, 80),
+        ({"visible_corners_unordered": [[1, 2], [3, 4]], "stickers": [[5, 6]]}, 2, False, 0.65 * 160),
         ({"ends": [[1, 2], [3, 4]]}, 2, True, 80),
         ({"marks": [[1, 2]], "size_px": 33}, 1, True, 33),
     ],

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from queries import make_queries
 
-from mmgsd.measure.regions import find_regions, summarise_places, summarise_regions
+from mmgsd.measure.regions import find_regions, measure_rings, summarise_places, summarise_regions
 
 
 def test_regions_by_hand() -> None:
@@ -23,6 +23,13 @@ def test_regions_by_hand() -> None:
     for points in regions.values():  # every group of a square leaves a region where it is
         grid = points.reshape(25, 25)
         assert (grid == grid[::-1]).all() and (grid == grid.T).all()
+
+
+def test_rings_lead_from_the_border_to_the_centre() -> None:
+    row, column = np.divmod(np.arange(625), 25)
+    errors = np.maximum(abs(row - 12), abs(column - 12)).astype(float).tolist()
+    assert measure_rings(errors) == list(range(12, -1, -1))
+    assert measure_rings([*errors[:312], None, *errors[313:]])[-1] is None
 
 
 def test_regions_are_summarised_over_visible_sources() -> None:

@@ -14,6 +14,7 @@ from test_heads_measured import write_weights
 
 from mmgsd.config import EvaluateConfig, load_preset
 from mmgsd.experiments import configure_study
+from mmgsd.match.matcher import Matcher
 from mmgsd.measure import shipped
 from mmgsd.measure.shipped import Masked, main, measure_baseline, measure_read, measure_study, measure_weights
 from mmgsd.paths import Paths
@@ -131,6 +132,40 @@ def test_photographs_alone_keep_what_renders_gave(root: Path, monkeypatch: pytes
     monkeypatch.setattr(sys, "argv", [sys.executable, "mine@2,4", "--photographs", "somewhere", "--photographs-alone"])
     main()
     assert json.loads(results.read_text())["mine@2,4"] == before | {"photographs": {"best": 3.0}}
+
+
+def test_photographs_alone_need_no_renders_of_anything(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    results = root / "data" / "results" / "shipped.json"
+    monkeypatch.setattr(sys, "argv", [sys.executable, "mine", "daisy"])
+    main()
+    before = json.loads(results.read_text())
+    for preset in shipped.SETS:
+        shutil.rmtree(Paths(root, preset).dataset("cloth"))
+    monkeypatch.setattr(shipped, "read_photographs", lambda *_: [])
+    monkeypatch.setattr(shipped, "measure_answers", lambda *_, **__: {"best": 3.0})
+    monkeypatch.setattr(shipped, "measure_photographs", lambda *_, **__: {"best": 4.0})
+    asked = ["mine", "daisy", "--photographs", "somewhere", "--photographs-alone"]
+    monkeypatch.setattr(sys, "argv", [sys.executable, *asked])
+    main()
+    after = json.loads(results.read_text())
+    assert after == {"mine": before["mine"] | {"photographs": {"best": 4.0}},
+                     "cloth-daisy": before["cloth-daisy"] | {"photographs": {"best": 3.0}}}  # fmt: skip
+
+
+def test_a_baseline_is_read_as_the_shipped_weights_are(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Sharp(Matcher):
+        @classmethod
+        def load(cls, path: Path) -> Matcher:
+            matcher = Matcher.load(path)
+            matcher.reading = dataclasses.replace(matcher.reading, sharpness=6.0)
+            return matcher
+
+    rows = [measure_baseline("daisy", "cloth", root, progress=False)]
+    monkeypatch.setattr(shipped, "Matcher", Sharp)
+    rows.append(measure_baseline("daisy", "cloth", root, progress=False))
+    assert [row["sharpness"] for row in rows] == [1, 6]
+    assert [shipped.name_read("cloth-daisy", row) for row in rows] == ["cloth-daisy", "cloth-daisy@1,6"]
+    assert rows[0]["paper"]["rmse_mean"] != rows[1]["paper"]["rmse_mean"]
 
 
 def test_modes_are_not_read_flatter_from_a_name_either(root: Path) -> None:

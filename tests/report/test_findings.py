@@ -17,10 +17,12 @@ RESULTS = load_results(Path(__file__).resolve().parents[2] / "data" / "results" 
 
 def test_a_finding_changes_with_its_results() -> None:
     results = copy.deepcopy(RESULTS)
-    results["rmse"]["cloth"]["mmgsd"]["rmse_mean"] = results["rmse"]["cloth"]["spcl"]["rmse_mean"] / 2
+    results["rmse"]["cloth"]["mmgsd_plain"]["rmse_mean"] = results["rmse"]["cloth"]["spcl"]["rmse_mean"] / 2
+    for seed in range(3):
+        results["seeds_1000"]["rope"][f"spcl-{seed}"] = results["seeds_1000"]["rope"][f"mmgsd-{seed}"]
     lines = make_findings(results).splitlines()
     assert len(lines) == len(FINDINGS)
-    assert "MMGSD has 50 % and" in lines[0]
+    assert "50 % and" in lines[0] and "SPCL on neither" in lines[2]
 
 
 def test_every_claim_is_a_row_with_what_repeats_it() -> None:
@@ -37,10 +39,11 @@ def test_a_claim_without_results_is_not_measured() -> None:
 
 @pytest.mark.parametrize(
     ("key", "models", "minutes"),
-    [("rmse", ("mmgsd",), "50"), ("ball", (), "–"), ("sigma", (), "7"), ("group", (), "9")],
+    [("rmse", ("mmgsd",), "50"), ("stable", (), "3"), ("ball", (), "–"), ("sigma", (), "7"), ("group", (), "9")],
 )
 def test_minutes_are_summed_over_the_runs_that_are_stored(key: str, models: tuple[str, ...], minutes: str) -> None:
     results = {"runs": {"cloth-mmgsd": {"minutes": 20.2}, "rope-mmgsd": {"minutes": 30.1}},
+               "seeds_1000": {"rope": {"spcl-0": {"run": {"minutes": 3.0}}}},
                "sigma": {"cloth": {"1": {"run": {"minutes": 7.0}}}},
                "symmetry": {"c4": {"run": {"minutes": 4.0}}, "d4": {"run": {"minutes": 5.0}}},
                "broken_symmetry": {"plain": {"rmse_mean": 3.0}}}  # fmt: skip

@@ -6,16 +6,19 @@ from mmgsd.report.shipped import (
     list_names,
     make_budget_sentence,
     make_by_source_table,
+    make_cloth_renders_table,
     make_counts_sentence,
     make_knowledge_table,
     make_limits_table,
     make_parts_table,
     make_pictures_table,
+    make_reading_sentence,
     make_readings_table,
     make_sources_sentence,
 )
 
-FOUND = {"photographs": 34, "found@5%": 0.512, "spurious": 0.25, "best": 8.04, "sources": {"a/b": {}, "c/d": {}}}
+FOUND = {"photographs": 34, "found@5%": 0.512, "spurious": 0.25, "unanswered": 0.306, "best": 8.04, "marks": "new",
+         "intervals": {"found@5%": [0.4, 0.62]}, "sources": {"a/b": {}, "c/d": {}}}  # fmt: skip
 HEADS = {"mask_iou": 0.951, "auroc_visible": 0.9, "auroc_on_object": 0.98, "auroc_absent": None}
 SET = {
     "rmse_mean": 21.04, "heads": HEADS, "auroc_absent": 0.3, "ece": 0.0264, "ece_confidence": 0.01,
@@ -37,10 +40,31 @@ def test_rows_are_in_the_order_of_interest() -> None:
 
 def test_what_was_not_measured_is_a_dash() -> None:
     lines = make_pictures_table(ROWS).splitlines()
-    assert lines[2] == "| cloth, `cloth` | 21.0 | 21.0 | 51 % | 25 % | 8.0 % |"
-    assert lines[3] == "| cloth, `cloth-paper` | 26.1 | 88.0 | – | – | – |"
-    assert lines[4] == "| cloth, DAISY | 71.2 | – | – | – | – |"
+    assert lines[2] == "| cloth, `cloth` | 21.0 | 21.0 | 51 % (40 to 62) | 25 % | 31 % | 8.0 % |"
+    assert lines[3] == "| cloth, `cloth-paper` | 26.1 | 88.0 | – | – | – | – |"
+    assert lines[4] == "| cloth, DAISY | 71.2 | – | – | – | – | – |"
     assert len({line.count("|") for line in lines}) == 1
+
+
+def test_one_table_has_one_reading_and_one_set_of_marks() -> None:
+    own, means = {"power": 1.0, "sharpness": 6.0}, {"power": 1.0, "sharpness": 1.0}
+    rows = {
+        "cloth": ROWS["cloth"] | own, "cloth-paper": ROWS["cloth-paper"] | means | {"photographs": FOUND},
+        "cloth-paper@1,6": own | {"photographs": FOUND | {"found@5%": 0.64, "intervals": {}}},
+        "cloth-daisy": {"photographs": FOUND}, "cloth-imagenet@1,6": own | {"photographs": FOUND | {"marks": "old"}},
+        "rope": ROWS["rope"] | own,
+    }  # fmt: skip
+    assert list_names(rows, "cloth") == ["cloth", "cloth-paper@1,6", "cloth-imagenet@1,6"]
+    lines = make_pictures_table(rows).splitlines()
+    assert lines[3:5] == ["| cloth, `cloth-paper` | – | – | 64 % | 25 % | 31 % | 8.0 % |",
+                          "| cloth, ImageNet features | – | – | – | – | – | – |"]  # fmt: skip
+    assert "power 1, sharpness 6 (cloth)" in make_reading_sentence(rows)
+
+
+def test_others_renders_are_beside_what_the_paper_says_of_its_own() -> None:
+    found = {"rmse_mean": 31.71, "median": 27.7, "pck@20px": 0.35}
+    lines = make_cloth_renders_table(ROWS | {"cloth": ROWS["cloth"] | {"cloth_renders": found}}).splitlines()
+    assert lines[2] == "| `cloth` | 31.7 | 27.7 | 35 % |" and "32.4" in lines[3] and len(lines) == 4
 
 
 def test_parts_are_told_one_after_another() -> None:
@@ -50,16 +74,20 @@ def test_parts_are_told_one_after_another() -> None:
         "| rope, **MMGSD** (ours)",
         "| rope, the same, with heads",
     ]
-    assert "| 21.0 | 99.0 |" in lines[2]
+    assert lines[2].endswith("| 21.0 | 99.0 |")  # of photographs nothing was measured
 
 
 def test_ways_of_reading_stand_beside_the_weights_own() -> None:
     means, own = {"power": 1.0, "sharpness": 1.0}, {"power": 1.5, "sharpness": 4.0}
-    rows = {"rope": {**own}, "cloth@1,1": {**means, "paper": {"rmse_mean": 25.6}}, "cloth": {**own, **ROWS["cloth"]}}
+    rows = {
+        "rope": {**own}, "cloth-spcl@1,6": {**own, "cloth_renders": {}},
+        "cloth@1,1": {**means, "paper": {"rmse_mean": 25.6}},
+        "cloth": {**own, **ROWS["cloth"]},
+    }  # fmt: skip
     lines = make_readings_table(rows).splitlines()
     assert lines[2:] == [
-        "| cloth, `cloth`, power 1.5, sharpness 4 | 21.0 | 21.0 | 51 % | 25 % | 8.0 % |",
-        "| cloth, `cloth`, power 1, sharpness 1 | 25.6 | – | – | – | – |",
+        "| cloth, `cloth`, power 1.5, sharpness 4 | 21.0 | 21.0 | 51 % (40 to 62) | 25 % | 31 % | 8.0 % |",
+        "| cloth, `cloth`, power 1, sharpness 1 | 25.6 | – | – | – | – | – |",
     ]
 
 
