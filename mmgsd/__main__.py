@@ -108,8 +108,10 @@ def _add_match(match: argparse.ArgumentParser) -> None:
     match.add_argument("--xy", type=_parse_pixel, action="append", required=True, metavar="X,Y",
                        help="column,row px in image0, the top left one is 0,0; may be given several times")  # fmt: skip
     match.add_argument("--n", type=_parse_number, metavar="N", help="modes, or auto; default: as many as its symmetry")
-    match.add_argument("--joint", action="store_true",
+    order = match.add_mutually_exclusive_group()
+    order.add_argument("--joint", action="store_true",
                        help="answer all pixels together: the modes of one number belong together")  # fmt: skip
+    order.add_argument("--seen-first", action="store_true", help="list matches that are seen before hidden ones")
     for name in ("mask0", "mask1"):
         match.add_argument(f"--{name}", type=_parse_image, metavar="FILE",
                            help=f"an image as large as image{name[-1]}, brighter than half on the object")  # fmt: skip

@@ -45,6 +45,7 @@ def match(args: argparse.Namespace) -> None:
     files = {"mask0": args.mask0, "mask1": args.mask1}
     masks = {k: f and read_mask(f, im.shape[:2]) for (k, f), im in zip(files.items(), images, strict=True)}
     answer = mmgsd.load(args.weights).match(*images, args.xy, n=args.n, joint=args.joint, **masks)
+    answer = answer.seen_first() if args.seen_first else answer
     described = describe_answer(answer)
     if args.out:
         draw_answer(answer, args.out)
@@ -73,6 +74,7 @@ def _match_folder(args: argparse.Namespace) -> None:
     plain = len({path.stem.casefold() for path in paths}) == len(paths)  # a.png and a.jpg are two pictures
     with _writing_rows(args.csv) if args.csv else nullcontext() as table:
         for (path, _), answer in zip(named, answers, strict=True):
+            answer = answer.seen_first() if args.seen_first else answer
             described = describe_answer(answer)
             if table:
                 table.writerows(_list_rows(path.name, described))

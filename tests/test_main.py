@@ -164,6 +164,16 @@ def test_pixels_are_answered_together(images, masks, capsys, tmp_path):
     assert [row.split(",")[3] for row in rows[1:]] == ["1", "2", "3", "4"] * 2
 
 
+@pytest.mark.parametrize("place", ["one", "folder"])
+def test_matches_that_are_seen_come_first_if_asked(images, capsys, place):
+    target = images[1] if place == "one" else str(Path(images[1]).parent)
+    asked = ["match", images[0], target, "--xy", "10,20", "--weights", "cloth", "--seen-first", "--json"]
+    told = json.loads(run(capsys, *asked).splitlines()[-1])
+    told = told if place == "one" else told["queries"]
+    visible = [mode["visible"] for query in told for mode in query["modes"]]
+    assert len(visible) > 1 and visible == sorted(visible, reverse=True)
+
+
 def test_a_pixel_may_lie_half_a_pixel_outside(weights, images, capsys):
     asked = ["match", *images, "--weights", weights, "--xy"]
     assert run(capsys, *asked, "-0.4,3").startswith("-0.4,3 -> ")

@@ -169,6 +169,20 @@ class Match:
         xy = np.where(able[:, None], self.modes[rows, chosen], np.nan)
         return Best(xy, self.spread_px[rows, chosen], confidence)
 
+    def seen_first(self) -> Match:
+        """The same answer, each query's modes ordered by ``visible``, those most probably seen first.
+
+        Of what does not know what is seen it is the answer itself. ValueError for a joint answer, whose columns belong
+        together.
+        """
+        if self.joint is not None:
+            raise ValueError("a joint answer's modes must stay in its order: ask without joint, or sort match.modes")
+        if self.visible is None:
+            return self
+        missing = np.isnan(self.modes).any(-1)
+        order = np.argsort(np.where(missing, np.inf, -self.visible), axis=1, kind="stable")
+        return dataclasses.replace(self, **_take_modes(self, order))
+
     @property
     def answerable(self) -> np.ndarray:
         """(S,) bool, whether the pixel asked about and image1 both show the object, as far as that is known."""
@@ -212,16 +226,21 @@ class Match:
 
 def sort_modes(match: Match, order: np.ndarray, joint: np.ndarray) -> Match:
     """The same answer with the modes in an ``order`` (S, k) of indices, that of ``joint`` (k,)."""
-    weights = np.take_along_axis(match.weights, order, 1)
+    taken = _take_modes(match, order)
+    weights = taken["weights"]
     total = weights.sum(1, keepdims=True)
-    return dataclasses.replace(
-        match,
-        modes=np.take_along_axis(match.modes, order[..., None], 1),
-        weights=np.divide(weights, total, out=weights, where=total > 0),
-        covariances=np.take_along_axis(match.covariances, order[..., None, None], 1),
-        visible=None if match.visible is None else np.take_along_axis(match.visible, order, 1),
-        joint=joint / joint.sum(),
-    )
+    taken["weights"] = np.divide(weights, total, out=weights, where=total > 0)
+    return dataclasses.replace(match, **taken, joint=joint / joint.sum())
+
+
+def _take_modes(match: Match, order: np.ndarray) -> dict[str, np.ndarray | None]:
+    """What a `Match` says of its modes, in an ``order`` (S, k) of indices."""
+    return {
+        "modes": np.take_along_axis(match.modes, order[..., None], 1),
+        "weights": np.take_along_axis(match.weights, order, 1),
+        "covariances": np.take_along_axis(match.covariances, order[..., None, None], 1),
+        "visible": None if match.visible is None else np.take_along_axis(match.visible, order, 1),
+    }
 
 
 def _is_mask(index: Any) -> bool:

@@ -17,7 +17,8 @@ The first of the five that is there counts. Each place of `SOURCES` photographs,
 only those with all corners), is asked for in every other photograph with places:
 
     found@5%, found@10%   share of the marked places that have a mode nearer than 5, 10 % of the object's size
-    spurious              share of the k most probable modes, k the marked places, farther than 10 % from all of them
+    spurious              share of the k modes most probably seen (`Match.seen_first`), k the marked places, farther
+                          than 10 % from all of them
     best                  distance of `Match.best` to the nearest marked place, % of the size; of answers that give one
 
 All are means over queries; their 95 % intervals are by bootstrap over the photographs, each with all its queries.
@@ -199,7 +200,7 @@ def score_answer(answer: Match, target: Photograph) -> pd.DataFrame:
     """A row a query: its photograph's from and file, and `MEASURES`."""
     size_px = target.size_px or target.share * max(answer.image1.shape[:2])
     rows, k = [], len(target.xy)
-    for modes, best in zip(answer.modes, answer.best().xy, strict=True):
+    for modes, best in zip(answer.seen_first().modes, answer.best().xy, strict=True):
         present = modes[~np.isnan(modes).any(1)]
         apart = np.linalg.norm(present[:, None] - target.xy[None], axis=-1) / size_px  # (n, k)
         near, nearest = apart.min(0), np.linalg.norm(target.xy - best, axis=1).min() / size_px

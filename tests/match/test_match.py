@@ -136,6 +136,20 @@ def test_the_best_mode_is_one_that_is_seen(rng: np.random.Generator) -> None:
         assert np.isnan(dataclasses.replace(seen, **unable).best().xy).all()
 
 
+def test_modes_that_are_seen_come_first_if_asked() -> None:
+    image, modes = np.zeros((20, 20, 3), np.uint8), np.arange(6.0).reshape(1, 3, 2)
+    modes[0, 0] = np.nan
+    match = Match(image, image, np.zeros((1, 2)), modes, np.array([[0.0, 0.6, 0.4]]), np.ones((1, 3, 2, 2)),
+                  np.zeros(1), np.zeros(1), np.ones((1, 2, 2)) / 4, visible=np.array([[np.nan, 0.2, 0.9]]))  # fmt: skip
+    first = match.seen_first()
+    assert first.visible.tolist()[0][:2] == [0.9, 0.2] and first.weights.tolist() == [[0.4, 0.6, 0.0]]
+    assert first.modes[0, :2].tolist() == [[4, 5], [2, 3]] and np.isnan(first.modes[0, 2]).all()
+    unknown = dataclasses.replace(match, visible=None)
+    assert unknown.seen_first() is unknown
+    with pytest.raises(ValueError, match="joint"):
+        dataclasses.replace(match, joint=np.ones(3) / 3).seen_first()
+
+
 def test_where_nothing_shows_the_object_nothing_is_sure() -> None:
     match = answer(draw_mixture(CORNERS[:2], 8.0), 2)
     known = dataclasses.replace(match, on_object=np.array([0.4]), absent=np.array([0.5]))
