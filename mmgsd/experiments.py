@@ -122,7 +122,7 @@ MODELS = (
           {"network": "lite0x2fine", "optimiser": "muon", "input_px": times(2), "roundness": 0.05, "heads": True,
            "clutter": True, "also": "workspace"}, ("backbones",), "EfficientNet-Lite0"),
     Model("dinov2s", "DINOv2 ViT-S/14, frozen", "light", {"network": "dinov2s"}, ("backbones",), "DINOv2 ViT-S"),
-    Model("recipe", "MMGSD, one recipe, until done", "dinov2s", {"steps": 20000}, ("recipe",), "MMGSD, done"),
+    Model("recipe", "MMGSD, one recipe, until done", "light", {"steps": 20000}, ("recipe",), "MMGSD, done"),
     # what each part of the shipped models' training brings, one after another
     Model("mmgsd_workspace", "MMGSD, workspace renders too", "mmgsd", {"also": "workspace"}, ("robustness",),
           "+ workspace"),
