@@ -113,7 +113,8 @@ def test_the_wheel_holds_every_module_and_the_shipped_weights(wheel: Path) -> No
         held = {name for name in archive.namelist() if ".dist-info/" not in name}
     kinds = {".py", ".js", ".css", ".typed"}
     modules = {str(path.relative_to(ROOT)) for path in (ROOT / "mmgsd").rglob("*") if path.suffix in kinds}
-    shipped = {f"mmgsd/weights/{path.name}" for path in (ROOT / "data" / "weights").iterdir() if path.suffix != ".py"}
+    kinds = {".safetensors", ".md"}
+    shipped = {f"mmgsd/weights/{path.name}" for path in (ROOT / "data" / "weights").iterdir() if path.suffix in kinds}
     samples = {f"mmgsd/samples/{name}/{path.name}" for name in OBJECTS for path in find_samples(name)}
     assert held == modules | shipped | samples
 
