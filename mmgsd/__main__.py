@@ -7,6 +7,7 @@ import os
 import re
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -70,6 +71,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog=prog, description=mmgsd.__doc__.partition("\n")[0])
     commands = parser.add_subparsers(dest="command", required=True, metavar="command")
     _add_match(commands.add_parser("match", help="find all matches of pixels of an image in others", epilog=EXAMPLE))
+    _add_find(commands.add_parser("find", help="find places of the object by name, without a first image"))
     _add_segment(commands.add_parser("segment", help="write where an image shows the object"))
     _add_measure(commands.add_parser("measure", help="measure on photographs with marked corners or ends"))
     _add_fold(commands.add_parser("fold", help="say where to pick and place in a picture, as a demonstration did"))
@@ -122,6 +124,20 @@ def _add_match(match: argparse.ArgumentParser) -> None:
     match.set_defaults(run=cli.match)
 
 
+def _add_find(find: argparse.ArgumentParser) -> None:
+    find.add_argument("image", type=_parse_image, help="the image to find them in")
+    find.add_argument("places", nargs="+", type=_parse_place, metavar="PLACE",
+                      help="corners, edges, centre or U,V in [0, 1] of a cloth; ends, middle or a fraction such as "
+                      "0.25 of a rope; of any object the number of a material point")  # fmt: skip
+    order = find.add_mutually_exclusive_group()
+    order.add_argument("--joint", action="store_true", help="answer all places together")
+    order.add_argument("--seen-first", action="store_true", help="list places that are seen before hidden ones")
+    find.add_argument("--mask", type=_parse_image, metavar="FILE", help="brighter than half on the object")
+    find.add_argument("--out", type=_parse_picture, metavar="FILE", help="draw the answer (png, jpg, pdf or svg)")
+    find.add_argument("--json", action="store_true", help="print the answer as JSON")
+    find.set_defaults(run=cli.find)
+
+
 def _add_fold(fold: argparse.ArgumentParser) -> None:
     fold.add_argument("demonstration", type=Path, metavar="DEMO.json", help="see docs/folding.md")
     fold.add_argument("image", type=_parse_image, help="a picture of the present state")
@@ -169,6 +185,17 @@ def _parse_pixel(text: str) -> tuple[float, float]:
         return float(parts[0]), float(parts[1])
     except ValueError as error:
         raise argparse.ArgumentTypeError(f"must be two numbers such as 212,148, got {text!r}") from error
+
+
+def _parse_place(text: str) -> Any:
+    """A name, the number of a point, a fraction, or two of these."""
+    if re.fullmatch(r"[A-Za-z_]+", text):
+        return text
+    try:
+        parts = tuple(map(float, text.split(",")))
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"must be a name, a number or U,V, got {text!r}") from error
+    return int(text) if text.isdecimal() else parts[0] if len(parts) == 1 else parts
 
 
 def _parse_picture(text: str) -> Path:

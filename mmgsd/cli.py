@@ -55,6 +55,23 @@ def match(args: argparse.Namespace) -> None:
     print(json.dumps(described) if args.json else "\n".join(map(format_query, described)), flush=True)
 
 
+def find(args: argparse.Namespace) -> None:
+    """Answer where places of the object are in an image."""
+    image = mmgsd.read_image(args.image)
+    mask = args.mask and read_mask(args.mask, image.shape[:2])
+    answer = mmgsd.load(args.weights).find(image, args.places, joint=args.joint, mask=mask)
+    answer = answer.seen_first() if args.seen_first else answer
+    described = [{"place": place, **query} for place, query in zip(args.places, describe_answer(answer), strict=True)]
+    if args.out:
+        draw_answer(answer, args.out)
+    lines = (f"{_name_place(query['place'])} -> {format_query(query).partition(' -> ')[2]}" for query in described)
+    print(json.dumps(described) if args.json else "\n".join(lines), flush=True)
+
+
+def _name_place(place: Any) -> str:
+    return ",".join(f"{value:g}" for value in place) if isinstance(place, tuple) else f"{place}"
+
+
 def _match_folder(args: argparse.Namespace) -> None:
     """Answer for one image after the other; RuntimeError at the end where some could not be answered for."""
     if args.out or args.mask0 or args.mask1:

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from mmgsd.checks import read_flag
-from mmgsd.config import CONTRASTIVE, TrainConfig
+from mmgsd.config import CONTRASTIVE, OBJECTS, TrainConfig
 from mmgsd.images import check_aspect, check_mask, check_pixels, to_rgb
 from mmgsd.learn.heads import Outputs, look_up, weigh_cells
 from mmgsd.learn.losses import compute_squared_distances
@@ -26,6 +26,7 @@ from mmgsd.match.calibration import Calibration
 from mmgsd.match.joint import join, spread_places
 from mmgsd.match.match import Match, sort_modes
 from mmgsd.match.mixture import AS_IT_IS, Mixture, Reading, check_count, check_modes, fit_modes, keep_most_probable
+from mmgsd.match.places import Flat, Place, lay_flat
 from mmgsd.match.weights import read_weights
 from mmgsd.numerics import own_numerics
 from mmgsd.paths import find_shipped
@@ -69,7 +70,7 @@ class Matcher:
     def __init__(
         self, network: torch.nn.Module, config: TrainConfig, *, modes: int, size: tuple[int, int], device: str = "",
         bandwidth: float | None = None, temperature: float = 1.0, power: float = 1.0, sharpness: float = 1.0,
-        calibration: Calibration | None = None,
+        calibration: Calibration | None = None, places: Tensor | None = None,
     ) -> None:  # fmt: skip
         check_scales(bandwidth=bandwidth, temperature=temperature)
         check_modes(modes)
@@ -82,6 +83,7 @@ class Matcher:
         self.reading = Reading(config.roundness, power, sharpness)
         self.turns = QUARTERS if config.rotate else 1  # what was trained upright knows only upright images
         self.bandwidth = config.margin / 4 if bandwidth is None and config.method in CONTRASTIVE else bandwidth
+        self.places = places  # (P, D) what the object's material points are described as, None where that is not known
 
     @classmethod
     @own_numerics(gradients=True)
@@ -146,7 +148,7 @@ class Matcher:
         They are weighted by where the second image shows the object: by ``mask1`` (H1, W1) bool, or else by the
         network's own mask, if it has one.
         """
-        source = self._sample_sources(said0, xy, size)  # (1, S, D)
+        source = self.sample_sources(said0, xy, size)  # (1, S, D)
         target = said1.descriptors[-self.config.descriptor_dim :]
         squared = compute_squared_distances(source, target.flatten(1).T[None])[0]  # (S, h * w)
         heatmap = compute_heatmap(squared, bandwidth=self.bandwidth, temperature=self.temperature)
@@ -172,7 +174,7 @@ class Matcher:
         places = modes.to(self.device).float().nan_to_num(-0.5)
         there = sample_descriptors(there, places.flatten(0, 1)[None], sizes[1])[0].unflatten(0, modes.shape[:2])
         channels = len(said1.descriptors)
-        source = self._sample_sources(said0, xy, sizes[0])[0][:, None]  # (S, 1, D)
+        source = self.sample_sources(said0, xy, sizes[0])[0][:, None]  # (S, 1, D)
         logits = self.network.heads.judge(source, there[..., :channels], there[..., channels:])
         return torch.sigmoid(logits) * modes.isfinite().all(-1).to(logits.device)
 
@@ -189,7 +191,8 @@ class Matcher:
         """(H, W) float32 in [0, 1] of an image of ``size`` (width, height), from an `Outputs.mask` (h, w)."""
         return cv2.resize(logits.sigmoid().cpu().numpy(), size, interpolation=cv2.INTER_LINEAR)
 
-    def _sample_sources(self, said0: Outputs, xy: Tensor, size: tuple[int, int]) -> Tensor:
+    def sample_sources(self, said0: Outputs, xy: Tensor, size: tuple[int, int]) -> Tensor:
+        """(1, S, D) what pixels ``xy`` (S, 2) of an image of ``size`` are asked about with."""
         sources = said0.descriptors[None, : self.config.descriptor_dim]
         return sample_descriptors(sources, xy[None].to(self.device).float(), size)
 
@@ -215,8 +218,47 @@ class Matcher:
         return self.prepare(image0, image1, mask0=mask0, mask1=mask1).match(xy, n=n, joint=joint)
 
     def prepare(self, image0: Any, image1: Any, *, mask0: Any = None, mask1: Any = None) -> Pair:
-        """Describe two images once, to ask about them many times; arguments and errors are those of `match`."""
+        """Describe two images once, to ask about them many times; arguments and errors are those of `match`.
+
+        Without ``image0`` the `Pair` is asked about places, as by `find`.
+        """
         return self._prepare(image0, image1, self.describe, mask0=mask0, mask1=mask1)
+
+    def find(self, image: Any, places: Any, *, n: Any = None, mask: Any = None, joint: bool = False) -> Match:
+        """Places of the object in ``image`` by name, without a first picture: "corners", "ends", "centre".
+
+        ``places`` is one or a list of them, a query each: of a cloth "corners", "edges" (their middles), "centre" or
+        (u, v) in [0, 1]; of a rope "ends", "middle" or a fraction of its length; of any object the number of a material
+        point; or what `average` learnt from pictures. The modes of a query are that place and those that look like it,
+        by default as many as there are. The `Match` has a drawing of the object laid flat for ``image0``. ``mask`` is
+        where the image shows the object; ``n`` and ``joint`` are those of `match`, and so are errors. ValueError of
+        weights that do not know their places (`python -m mmgsd calibrate` adds them), and for others than these.
+        """
+        return self.prepare(None, image, mask1=mask).match(places, n=n, joint=joint)
+
+    @own_numerics()
+    def average(self, pictures: Iterable[tuple[Any, Any]]) -> Place:
+        """A place from several pictures (image, (x, y)) of it or of those that look like it, for `find`.
+
+        ValueError where there is none, and for an image or a pixel that `match` refuses.
+        """
+        sampled = []
+        for image, xy in pictures:
+            image = to_rgb(image)
+            size = image.shape[1::-1]
+            self.compute_input_size(image)
+            points = check_pixels(xy, size, image="image")
+            sampled.append(self.sample_sources(self.describe([image])[0], torch.from_numpy(points), size)[0])
+        if not sampled:
+            raise ValueError("pictures must be (image, (x, y)), one or more, got none")
+        return Place(torch.cat(sampled).mean(0, keepdim=True))
+
+    def lay_flat(self) -> Flat:
+        """The object laid flat, as its places are asked for; ValueError of weights that do not know them."""
+        if self.places is None:
+            raise ValueError(f"these weights of {self.config.name} do not know the object's places, so image0 must be "
+                             "given: python -m mmgsd calibrate adds them")  # fmt: skip
+        return lay_flat(self.places.to(self.device), self.object, self.config.group)
 
     def match_many(
         self, questions: Iterable[tuple[Any, ...]], *, n: Any = None, joint: bool = False
@@ -224,8 +266,9 @@ class Matcher:
         """The answers to many questions, each when it is asked for, so in little memory.
 
         A question is (image0, image1, xy), or (image0, image1, xy, mask0, mask1) with None for a mask that there is
-        not. An image that comes again soon, by its pixels, is described once: a reference before many frames. ``n``,
-        ``joint`` and errors are those of `match`; after an error there is no further answer.
+        not; (None, image1, places) asks what `find` does. An image that comes again soon, by its pixels, is described
+        once: a reference before many frames. ``n``, ``joint`` and errors are those of `match`; after an error there is
+        no further answer.
         """
         recent = _Recent(self.describe)
         for image0, image1, xy, mask0, mask1 in map(fill_question, questions):
@@ -236,6 +279,8 @@ class Matcher:
         self, image0: Any, image1: Any, describe: Callable[[list[np.ndarray]], list[Outputs]], *, mask0: Any = None,
         mask1: Any = None,
     ) -> Pair:  # fmt: skip
+        if image0 is None:
+            return self._prepare_flat(image1, describe, mask0, mask1)
         images = {name: to_rgb(image, name) for name, image in (("image0", image0), ("image1", image1))}
         for name, image in images.items():
             self.compute_input_size(image, name)
@@ -243,6 +288,16 @@ class Matcher:
         for (name, mask), image in zip(masks.items(), images.values(), strict=True):
             masks[name] = None if mask is None else check_mask(mask, image.shape[:2], name)
         return Pair(self, *images.values(), tuple(describe(list(images.values()))), **masks)
+
+    def _prepare_flat(
+        self, image1: Any, describe: Callable[[list[np.ndarray]], list[Outputs]], mask0: Any, mask1: Any
+    ) -> Pair:
+        if mask0 is not None:
+            raise ValueError("mask0 must be None where there is no image0")
+        image = to_rgb(image1, "image1")
+        self.compute_input_size(image, "image1")
+        mask = None if mask1 is None else check_mask(mask1, image.shape[:2], "mask1")
+        return Pair(self, None, image, (None, *describe([image])), None, mask)
 
 
 class _Recent:
@@ -270,17 +325,20 @@ class Pair:
     """Two images and what the network says of them: each question takes a few milliseconds."""
 
     matcher: Matcher
-    image0: np.ndarray  # (H0, W0, 3) uint8
+    image0: np.ndarray | None  # (H0, W0, 3) uint8; None: it is asked about places
     image1: np.ndarray  # (H1, W1, 3) uint8
-    said: tuple[Outputs, Outputs]
+    said: tuple[Outputs | None, Outputs]
     mask0: np.ndarray | None = None  # (H0, W0) bool, of the caller's
     mask1: np.ndarray | None = None  # (H1, W1) bool
 
     @own_numerics()
     def match(self, xy: Any, *, n: Any = None, joint: bool = False) -> Match:
-        """As `Matcher.match`."""
+        """As `Matcher.match`, or without ``image0`` as `Matcher.find`, with places for ``xy``."""
+        joint = read_flag("joint", joint)
+        if self.image0 is None:
+            return self._find(xy, n, joint)
         points = check_pixels(xy, self.image0.shape[1::-1])
-        if not read_flag("joint", joint):
+        if not joint:
             return self._match(points, n)
         count = check_answers(self.matcher.modes if n is None else n, self.matcher.modes)
         mask = self._find_mask()
@@ -290,6 +348,16 @@ class Pair:
         weights = np.take_along_axis(match.weights, order, 1)
         heavy = weights[len(points) if len(places) else 0 :].sum(0) + 1e-9
         return sort_modes(match[: len(points)], order[: len(points), :count], heavy[:count])
+
+    def _find(self, places: Any, n: Any, joint: bool) -> Match:
+        learnt = isinstance(places, Place)
+        flat = lay_flat(places.descriptors, "", "") if learnt else self.matcher.lay_flat()
+        if joint and flat.object not in OBJECTS:
+            of = "pictures" if learnt else repr(flat.object)
+            raise ValueError(f"joint must be False for places of {of}: how they lie beside each other is not known")
+        xy, counts = flat.look_up(list(range(len(places.descriptors))) if learnt else places)
+        asked = dataclasses.replace(self, image0=flat.image, said=(flat.outputs, self.said[1]), mask0=flat.mask)
+        return asked.match(xy, n=counts if n is None and not joint else n, joint=joint)
 
     def _find_mask(self) -> np.ndarray:
         """(H0, W0) bool, where image0 shows the object."""

@@ -15,8 +15,10 @@ from torch import Tensor
 from mmgsd.config import TrainConfig, from_dict
 from mmgsd.learn.network import build_network
 from mmgsd.match.calibration import parse_calibration
+from mmgsd.match.places import check_places
 
 FORMAT = "mmgsd-1"
+PLACES = "places"  # beside the network's tensors: what its object's material points are described as
 PICKLES = (b"PK\x03\x04", b"\x80")  # how PyTorch's own files begin
 NUMBERS = ("bandwidth", "temperature", "power", "sharpness")  # settings that not every file has
 LARGEST = {"input_px": 8192, "descriptor_dim": 4096}  # of a configuration; more would not fit a memory
@@ -38,7 +40,7 @@ class Weights:
 
     network: torch.nn.Module
     config: TrainConfig
-    settings: dict[str, Any]  # modes, size, and where they are stored `NUMBERS` and calibration
+    settings: dict[str, Any]  # modes, size, and where they are stored `NUMBERS`, calibration and places
     object: str  # what was taught, "" where the file does not say
 
 
@@ -63,6 +65,8 @@ def read_weights(path: Path | str) -> Weights:
     settings |= {name: _read(path, metadata, name, float) for name in NUMBERS if name in metadata}
     if "calibration" in metadata:
         settings["calibration"] = _read(path, metadata, "calibration", parse_calibration)
+    if PLACES in state:
+        settings["places"] = _read_places(path, state.pop(PLACES), config)
     return Weights(_make_network(path, config, state), config, settings, config.object if known else "")
 
 
@@ -125,6 +129,13 @@ def _read_config(path: Path, metadata: dict[str, str]) -> tuple[TrainConfig, boo
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: of 'config' in its metadata, {error}: get the file anew") from error
     return config, "object" in values
+
+
+def _read_places(path: Path, values: Tensor, config: TrainConfig) -> Tensor:
+    try:
+        return check_places(values, config.descriptor_dim)
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged: {error}: get the file anew") from error
 
 
 def _make_network(path: Path, config: TrainConfig, state: dict[str, Tensor]) -> torch.nn.Module:

@@ -17,6 +17,7 @@ import numpy as np
 import pandas as pd
 import torch
 from scipy.optimize import minimize, minimize_scalar
+from torch import Tensor
 
 from mmgsd.checks import read_count, read_flag
 from mmgsd.config import EvaluateConfig
@@ -24,6 +25,7 @@ from mmgsd.dataset import Dataset, hold_out, join_datasets, load_dataset, load_p
 from mmgsd.learn.checkpoints import load_metadata, read_tensors, write_tensors
 from mmgsd.match.calibration import LEVELS, Calibration, Modes, compute_unit, parse_calibration
 from mmgsd.match.matcher import Matcher
+from mmgsd.match.weights import PLACES
 from mmgsd.measure.questions import ask, choose_points, describe, measure_mean_error, model_answer
 from mmgsd.measure.reading import choose_reading
 from mmgsd.measure.uncertainty import (
@@ -39,6 +41,8 @@ from mmgsd.numerics import own_numerics
 
 BANDWIDTHS = (1 / 64, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2)  # of a contrastive heatmap, in margins
 TEMPERATURES = (0.1, 10.0)  # range in which the calibrated one is sought
+BATCH = 16  # images that are described at a time
+PICTURES = 400  # at most, that an object's places are described by
 PAIRS, LEAST_PAIRS = 400, 40  # drawn, and the fewest: half of these can just tell the level of 95 %
 
 
@@ -65,7 +69,7 @@ def calibrate_weights(
                          f"{dataset} has {data.fingerprint}")  # fmt: skip
     held_out = join_datasets(*(hold_out(part)[1] for part in parts))
     found = _calibrate(matcher, held_out, "dataset must hold out", pairs=pairs, points=points, progress=progress)
-    return _keep(weights, {"calibration": found})
+    return _keep(weights, {"calibration": found}, describe_places(matcher, held_out))
 
 
 @own_numerics()
@@ -92,7 +96,8 @@ def calibrate_unseen(
     reading = choose_reading(matcher, data, progress=read_flag("progress", progress))
     found = _calibrate(matcher, data, "unseen must hold test", pairs=pairs, **how)
     chosen = {"power": repr(reading.power), "sharpness": repr(reading.sharpness)}
-    return _keep(weights, {**chosen, "calibration": found, "unseen": json.dumps([p.fingerprint for p in parts])})
+    note = {**chosen, "calibration": found, "unseen": json.dumps([p.fingerprint for p in parts])}
+    return _keep(weights, note, describe_places(matcher, data))
 
 
 def _calibrate(matcher: Matcher, data: Dataset, accepted: str, *, pairs: int, points: int, progress: bool) -> str:
@@ -104,10 +109,33 @@ def _calibrate(matcher: Matcher, data: Dataset, accepted: str, *, pairs: int, po
     return found.to_json()
 
 
-def _keep(weights: Path, found: dict[str, str]) -> Path:
-    """Add to a file's metadata; its tensors stay."""
+def _keep(weights: Path, found: dict[str, str], places: Tensor) -> Path:
+    """Add to a file's metadata, and the object's places; its network's tensors stay."""
     tensors, note = read_tensors(weights)
-    return write_tensors(weights, tensors, note | found)
+    return write_tensors(weights, tensors | {PLACES: places.cpu()}, note | found)
+
+
+@own_numerics()
+def describe_places(matcher: Matcher, data: Dataset, *, pictures: int = PICTURES, seed: int = 0) -> Tensor:
+    """What `Matcher.find` asks about, (P, D): the mean descriptor of each material point and its like ones.
+
+    Over ``pictures`` images of ``data``, drawn, or all that there are, where the points are seen. A point that none of
+    them shows has that of the nearest one by number which is seen.
+    """
+    drawn = np.random.default_rng(seed).permutation(np.flatnonzero(data.present))[:pictures]
+    total = torch.zeros(data.n_points, matcher.config.descriptor_dim, dtype=torch.float64)
+    seen = torch.zeros(data.n_points, 1, dtype=torch.float64)
+    for batch in np.array_split(drawn, -(-len(drawn) // BATCH)):
+        for index, outputs in describe(matcher, data, batch).items():
+            points = torch.from_numpy(data.visible[index])
+            xy = torch.from_numpy(data.xy[index][data.visible[index]])
+            total[points] += matcher.sample_sources(outputs, xy, data.size)[0].double().cpu()
+            seen[points] += 1
+    orbits = torch.from_numpy(data.group(matcher.config.group).permutations.T.copy())  # (P, G)
+    mean, known = total[orbits].sum(1) / seen[orbits].sum(1).clamp(min=1), seen[orbits].sum((1, 2)) > 0
+    numbers = torch.arange(data.n_points)
+    nearest = (numbers[:, None] - numbers[known]).abs().argmin(1)
+    return mean[known][nearest].float()
 
 
 def read_calibration(weights: Path | str) -> Calibration | None:

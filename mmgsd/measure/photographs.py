@@ -21,6 +21,9 @@ only those with all corners), is asked for in every other photograph with places
                           than 10 % from all of them
     best                  distance of `Match.best` to the nearest marked place, % of the size; of answers that give one
 
+Of a cloth's corners and a rope's ends all but the last is also counted of `Matcher.find`, "by_name": there no other
+picture is asked about, so every photograph is one query.
+
 All are means over queries; their 95 % intervals are by bootstrap over the photographs, each with all its queries.
 """
 
@@ -151,7 +154,18 @@ def measure_answers(
         seen(photograph, answer)
         rows.append(score_answer(answer, photograph))
     about = {"photographs": len(photographs), "marks": digest_marks(photographs)}
-    return about | summarise_photographs(pd.concat(rows, ignore_index=True))
+    found = about | summarise_photographs(pd.concat(rows, ignore_index=True))
+    named = measure_by_name(matcher, photographs)
+    return found if named is None else found | {"by_name": named}
+
+
+def measure_by_name(matcher: Any, photographs: list[Photograph]) -> dict[str, Any] | None:
+    """`summarise_photographs` of the corners or ends that `Matcher.find` finds; None of what cannot be asked so."""
+    name = ENDS.get(getattr(matcher, "object", ""), ("",))[0]
+    if getattr(matcher, "places", None) is None or not name:
+        return None
+    rows = [score_answer(matcher.find(photograph.read(), name), photograph) for photograph in photographs]
+    return summarise_photographs(pd.concat(rows, ignore_index=True))
 
 
 def digest_marks(photographs: list[Photograph]) -> str:

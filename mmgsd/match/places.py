@@ -1,0 +1,117 @@
+"""Places of an object asked for by name, without a first picture: how its material points are described on average.
+
+A model's file keeps the mean descriptor of each material point over renders, and of a point and its like places
+together. Laid out flat they take the part of a first image: `Flat` is that image, its descriptors and its mask.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from mmgsd.config import N_POINTS, OBJECTS
+from mmgsd.learn.heads import Outputs
+from mmgsd.symmetry import load_group
+
+SIDE = round(N_POINTS**0.5)
+NAMES = {  # of a place and all that look like it: one of its material points
+    "cloth": {"corners": 0, "edges": SIDE // 2, "centre": N_POINTS // 2},
+    "rope": {"ends": 0, "middle": N_POINTS // 2},
+}
+CLOTH_CELL_PX, LINE_PX = 16, 16  # of a flat picture: a cell of a cloth's; the height of any other's
+GROUND, OBJECT, EDGE = 235, 170, 90  # grey levels
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """What some places are described as, the mean over pictures (`Matcher.average`): `Matcher.find` takes it."""
+
+    descriptors: Tensor  # (S, D)
+
+
+@dataclass(frozen=True, eq=False)
+class Flat:
+    """An object laid flat, to be asked about like an image: a cloth's points row by row, any others' along a line."""
+
+    image: np.ndarray  # (H, W, 3) uint8
+    mask: np.ndarray  # (H, W) bool
+    outputs: Outputs  # descriptors (D, h, w), a cell a material point
+    object: str
+    group: str
+
+    def look_up(self, places: Any) -> tuple[np.ndarray, np.ndarray | None]:
+        """Pixels (S, 2) of places, and how many like places (S,) each has, None where that is not known.
+
+        A place is a name of `NAMES`, the number of a material point, or where it lies from 0 to 1: (u, v) along a
+        cloth's columns and rows, a number with a fraction along a rope. ValueError for anything else.
+        """
+        several = isinstance(places, list) or (isinstance(places, np.ndarray) and places.ndim > 1)
+        at = np.array([self._find(place) for place in (places if several else [places])]).reshape(
+            -1, 2
+        )  # columns, rows
+        height, width = self.outputs.descriptors.shape[1:]
+        cell = np.array([self.image.shape[1] / width, self.image.shape[0] / height])
+        if self.object not in OBJECTS:
+            return ((at + 0.5) * cell - 0.5).astype(np.float32), None
+        column, row = at.round().astype(int).T
+        counts = load_group(self.object, self.group).count_modes(row * width + column)
+        return ((at + 0.5) * cell - 0.5).astype(np.float32), counts
+
+    def _find(self, place: Any) -> tuple[float, float]:
+        """Column and row, with fractions, of a place."""
+        height, width = self.outputs.descriptors.shape[1:]
+        number = NAMES.get(self.object, {}).get(place) if isinstance(place, str) else place
+        if isinstance(number, int | np.integer) and not isinstance(number, bool) and 0 <= number < height * width:
+            return float(number % width), float(number // width)
+        line = height == 1 and isinstance(number, float | np.floating)
+        along = (number, 0.0) if line and self.object in OBJECTS else number
+        if self.object in OBJECTS and isinstance(along, tuple | np.ndarray) and np.shape(along) == (2,):
+            u, v = map(float, along)
+            if 0 <= u <= 1 and 0 <= v <= 1:
+                return u * (width - 1), v * (height - 1)
+        raise ValueError(f"places must be {self._accepted()}, or a list of these, got {place!r:.80}")
+
+    def _accepted(self) -> str:
+        names = [
+            *map(repr, NAMES.get(self.object, {})),
+            f"a point's number below {self.outputs.descriptors[0].numel()}",
+        ]
+        return ", ".join(names) + {"cloth": ", (u, v) in [0, 1]", "rope": ", a fraction of its length"}.get(
+            self.object, ""
+        )
+
+
+def lay_flat(descriptors: Tensor, object: str, group: str) -> Flat:
+    """The object whose material points (P, D) are described so; ValueError for a cloth or rope of another P."""
+    if object in OBJECTS and len(descriptors) != N_POINTS:
+        raise ValueError(f"places of a {object} must be {N_POINTS}, got {len(descriptors)}")
+    cloth = object == "cloth"
+    rows = SIDE if cloth else 1
+    image, mask = _draw_cloth() if cloth else _draw_line(len(descriptors))
+    return Flat(image, mask, Outputs(descriptors.T.unflatten(1, (rows, -1)).contiguous()), object, group)
+
+
+def _draw_cloth() -> tuple[np.ndarray, np.ndarray]:
+    side = SIDE * CLOTH_CELL_PX
+    image = np.full((side, side, 3), OBJECT, np.uint8)
+    cv2.rectangle(image, (0, 0), (side - 1, side - 1), (EDGE,) * 3, thickness=3)
+    return image, np.ones((side, side), bool)
+
+
+def _draw_line(count: int) -> tuple[np.ndarray, np.ndarray]:
+    mask = np.zeros((LINE_PX, count), bool)
+    mask[LINE_PX // 2 - 1 : LINE_PX // 2 + 1] = True
+    image = np.where(mask, EDGE, GROUND).astype(np.uint8)
+    return np.repeat(image[..., None], 3, 2), mask
+
+
+def check_places(values: Tensor, descriptor_dim: int) -> Tensor:
+    """Descriptors (P, D) as float32; ValueError for another shape or what is not finite."""
+    if values.ndim != 2 or not len(values) or values.shape[1] != descriptor_dim or not values.isfinite().all():
+        raise ValueError(f"places must be finite, (P, {descriptor_dim}), got {tuple(values.shape)}")
+    return values.to(torch.float32)
