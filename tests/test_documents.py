@@ -151,7 +151,7 @@ def test_extras_exist() -> None:
 def test_the_lines_of_python_run(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
     rendered = []
-    monkeypatch.setattr("mmgsd.scene.rendering.render_dataset", lambda config, *args, **how: rendered.append(config))
+    monkeypatch.setattr("mmgsd.scene.stage.render_dataset", lambda config, *args, **how: rendered.append(config))
     names: dict[str, object] = {}
     for name in ("README.md", "docs/your-photographs.md"):
         text = (ROOT / name).read_text("utf-8")

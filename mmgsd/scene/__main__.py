@@ -26,7 +26,7 @@ from typing import Any
 from mmgsd.config import RenderConfig, from_dict
 from mmgsd.files import writing
 from mmgsd.images import encode_image, encode_mask
-from mmgsd.scene.sheet import Sheet
+from mmgsd.scene.objects.planar_object import Sheet
 
 PR_SET_PDEATHSIG = 1  # of Linux: which signal a process gets when its parent ends
 

@@ -8,9 +8,9 @@ import bpy
 import numpy as np
 
 from mmgsd.config import OBJECTS, SCENES, RenderConfig
-from mmgsd.scene import randomize, render
-from mmgsd.scene.render import DeformedObject, View
-from mmgsd.scene.sheet import Sheet
+from mmgsd.scene import blender, randomize
+from mmgsd.scene.blender import DeformedObject, View
+from mmgsd.scene.objects.planar_object import Sheet
 
 SPLITS = ("train", "test")
 
@@ -27,13 +27,13 @@ def render_episode(
     kind = OBJECTS.index(config.object) if sheet is None else zlib.crc32(sheet.name.encode())
     around = [SCENES.index(config.scene)] if config.scene != "plain" else []  # the plain scene's stream is as it was
     rng = np.random.default_rng([config.seed, kind, SPLITS.index(split), episode, *around])
-    scene = render.reset_scene()
+    scene = blender.reset_scene()
     deformed = build_object(rng, config, sheet)
     size = config.size if sheet is None else sheet.size
-    render.setup_cycles(scene, size, config.samples)
-    bvh = render.build_bvh(deformed.mesh)
+    blender.setup_cycles(scene, size, config.samples)
+    bvh = blender.build_bvh(deformed.mesh)
     if config.scene == "workspace":
-        from mmgsd.scene.workspace import render_view
+        from mmgsd.scene.workspace.view import render_view
 
         return [render_view(rng, config, size, scene, deformed, bvh) for _ in range(n_views)]
     floor = add_floor()
@@ -43,20 +43,20 @@ def render_episode(
 def build_object(rng: np.random.Generator, config: RenderConfig, sheet: Sheet | None = None) -> DeformedObject:
     """Add a randomly deformed object of the configured kind to the current scene."""
     if sheet is not None:
-        from mmgsd.scene.cloth import build_sheet
+        from mmgsd.scene.objects.cloth import build_sheet
 
         return build_sheet(rng, sheet)
     if config.object == "cloth":
-        from mmgsd.scene.cloth import build_cloth as build
+        from mmgsd.scene.objects.cloth import build_cloth as build
     else:
-        from mmgsd.scene.rope import build_rope as build
+        from mmgsd.scene.objects.rope import build_rope as build
     return build(rng, config)
 
 
 def add_floor() -> bpy.types.Object:
     """Add the plane z = 0, 12 m wide, to the current scene."""
     corners = np.array([[-6, -6, 0], [6, -6, 0], [6, 6, 0], [-6, 6, 0]], dtype=float)
-    return render.add_mesh("floor", corners, np.array([[0, 1, 2, 3]]))
+    return blender.add_mesh("floor", corners, np.array([[0, 1, 2, 3]]))
 
 
 def _render_view(
@@ -66,19 +66,19 @@ def _render_view(
     scene: bpy.types.Scene,
     deformed: DeformedObject,
     floor: bpy.types.Object,
-    bvh: render.BVHTree,
+    bvh: blender.BVHTree,
 ) -> View:
     camera, turn = randomize.draw_camera(rng, deformed.points, size, config.rotation_deg)
-    render.place_camera(scene, camera)
+    blender.place_camera(scene, camera)
     randomize.draw_light(rng, scene)
     colour, background = randomize.draw_background(rng, floor)
     texture = randomize.draw_object_material(rng, deformed.mesh, colour)
-    image, mask = render.render_image(scene, seed=int(rng.integers(2**31)))
+    image, mask = blender.render_image(scene, seed=int(rng.integers(2**31)))
     return View(
         image=image,
         mask=mask,
         xy=camera.project(deformed.points).astype(np.float32),
-        visible=render.find_visible(deformed, bvh, camera),
+        visible=blender.find_visible(deformed, bvh, camera),
         intrinsics=camera.intrinsics,
         camera_pose=camera.pose,
         info={**deformed.info, "turn_deg": turn, "texture": texture, "background": background},

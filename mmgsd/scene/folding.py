@@ -21,7 +21,7 @@ from mmgsd.cluster import wait_for_each
 from mmgsd.files import DamagedFileError, scratch_folder, set_aside, write_bytes
 from mmgsd.fold.tasks import GROUNDS, STARTS, Move, Task, find_task, place_truth
 from mmgsd.progress import ProgressBar
-from mmgsd.scene.rendering import RenderError, connect, explain, run_child
+from mmgsd.scene.stage import RenderError, connect, explain, run_child
 from mmgsd.scene.state import State, read_state
 
 __all__ = ["State", "act_job", "demonstration_job", "look_job", "read_state", "run_jobs", "start_job", "true_moves"]

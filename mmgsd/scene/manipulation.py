@@ -22,17 +22,18 @@ from scipy.ndimage import binary_dilation
 
 from mmgsd.config import IMAGE_SIZE
 from mmgsd.fold.tasks import Task, find_task
-from mmgsd.scene import cloth, randomize, render, rope
+from mmgsd.scene import blender, randomize
+from mmgsd.scene.blender import Camera, DeformedObject
 from mmgsd.scene.episode import add_floor
-from mmgsd.scene.grounds import Site, draw_ground
-from mmgsd.scene.materials import paint_object
-from mmgsd.scene.meshes import SPACING
-from mmgsd.scene.render import Camera, DeformedObject
+from mmgsd.scene.objects import cloth, rope
+from mmgsd.scene.objects.meshes import SPACING
+from mmgsd.scene.objects.rope_shape import LENGTH, OwnPart, RopeShape, sample_rope
 from mmgsd.scene.rope_pull import pull_rope
-from mmgsd.scene.rope_shape import LENGTH, OwnPart, RopeShape, sample_rope
 from mmgsd.scene.state import State, read_state, write_state
-from mmgsd.scene.things import add_things
-from mmgsd.scene.workspace import draw_light, find_seen, frame_points
+from mmgsd.scene.workspace.distractors import add_things
+from mmgsd.scene.workspace.materials import paint_object
+from mmgsd.scene.workspace.surfaces import Site, draw_ground
+from mmgsd.scene.workspace.view import draw_light, find_seen, frame_points
 
 SAMPLES = 1  # of Cycles, a pixel, as the rendered sets have
 MAX_OFFSET = 0.1  # m from the origin, along x and y, of a first state
@@ -252,15 +253,15 @@ def look_again(state: State, again: int, mark: str) -> State:
 
 def _look(vertices: np.ndarray, first: np.ndarray | None, about: dict[str, Any]) -> State:
     """Render and label the object; ``first`` (625, 3) m are the points of the rollout's first look, None for that."""
-    scene = render.reset_scene()
+    scene = blender.reset_scene()
     deformed = _add_object(vertices.astype(float), about)
     points = deformed.points.astype(np.float32)
     first = points if first is None else first
     room = find_room(first.astype(float), find_task(about["task"]))
     camera, turn = _draw_camera(room, about)
-    render.setup_cycles(scene, camera.size, SAMPLES)
-    render.place_camera(scene, camera)
-    visible = render.find_visible(deformed, render.build_bvh(deformed.mesh), camera)
+    blender.setup_cycles(scene, camera.size, SAMPLES)
+    blender.place_camera(scene, camera)
+    visible = blender.find_visible(deformed, blender.build_bvh(deformed.mesh), camera)
     image, mask = _render(scene, deformed, room, camera, turn, about)
     xy = camera.project(deformed.points).astype(np.float32)
     visible &= _is_near(mask, xy)  # a thing may stand before it
@@ -314,7 +315,7 @@ def _render(
         randomize.draw_object_material(rng, deformed.mesh, colour)
     else:
         masked = _furnish(rng, scene, deformed, room, camera, turn, about)
-    image, mask = render.render_image(scene, seed=int(rng.integers(2**31)))
+    image, mask = blender.render_image(scene, seed=int(rng.integers(2**31)))
     if masked is not None:
         image[~mask] = masked
     return image, mask

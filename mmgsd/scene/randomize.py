@@ -7,8 +7,8 @@ import numpy as np
 from mathutils import Euler, Vector
 
 from mmgsd.scene import SceneError
-from mmgsd.scene.render import Camera
-from mmgsd.scene.textures import (
+from mmgsd.scene.blender import Camera
+from mmgsd.scene.textures.procedural import (
     BACKGROUNDS,
     CLOTH_TEXTURES,
     OBJECT_TEXTURES,

@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from mmgsd.scene import SceneError
-from mmgsd.scene.render import MASK_PASS
+from mmgsd.scene.blender import MASK_PASS
 
 Colour = tuple[float, float, float, float]  # linear RGBA
 CLUTTER_PX = 512

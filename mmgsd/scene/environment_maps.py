@@ -10,8 +10,8 @@ import numpy as np
 from PIL import Image
 
 from mmgsd.scene import SceneError
+from mmgsd.scene.blender import encode_srgb
 from mmgsd.scene.randomize import set_world
-from mmgsd.scene.render import encode_srgb
 
 NODE = "environment"  # of the world's shader, while a map lights it
 

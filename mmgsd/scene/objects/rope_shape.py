@@ -15,7 +15,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
 from mmgsd.scene import SceneError
-from mmgsd.scene.rope_relax import EXCLUDE, MIN_RADIUS, STEP, relax
+from mmgsd.scene.objects.rope_relax import EXCLUDE, MIN_RADIUS, STEP, relax
 
 LENGTH = 1.6  # m, of every rope
 USUAL = 50  # diameters that a rope is long; longer ones bend in wider turns

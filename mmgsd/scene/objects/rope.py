@@ -13,8 +13,8 @@ import bpy
 import numpy as np
 
 from mmgsd.config import N_POINTS, RenderConfig
-from mmgsd.scene.render import DeformedObject, add_mesh
-from mmgsd.scene.rope_shape import LENGTH, OwnPart, RopeShape, resample, sample_rope
+from mmgsd.scene.blender import DeformedObject, add_mesh
+from mmgsd.scene.objects.rope_shape import LENGTH, OwnPart, RopeShape, resample, sample_rope
 
 RINGS = {"laid": 480, "braided": 400, "cable": 480}  # cross-sections of a strand
 SIDES = {"laid": 8, "braided": 6, "cable": 12}  # corners of a cross-section

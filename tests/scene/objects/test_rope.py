@@ -6,8 +6,9 @@ import sys
 import numpy as np
 import pytest
 
-from mmgsd.scene import SceneError, rope_shape
-from mmgsd.scene.rope_shape import LENGTH, STATES, OwnPart, RopeShape, find_crossings, resample, sample_rope
+from mmgsd.scene import SceneError
+from mmgsd.scene.objects import rope_shape
+from mmgsd.scene.objects.rope_shape import LENGTH, STATES, OwnPart, RopeShape, find_crossings, resample, sample_rope
 
 SEEDS = 60
 

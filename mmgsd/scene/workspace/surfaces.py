@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import bpy
 import numpy as np
 
-from mmgsd.scene.materials import PREFIX, paint_plain, paint_surface
-from mmgsd.scene.prints import Bytes, draw_other, draw_paint, draw_table, vary_paint
-from mmgsd.scene.render import add_mesh
-from mmgsd.scene.solids import Solid, make_box, make_walls, merge, move
+from mmgsd.scene.blender import add_mesh
+from mmgsd.scene.textures.printed import Bytes, draw_other, draw_paint, draw_table, vary_paint
+from mmgsd.scene.workspace.materials import PREFIX, paint_plain, paint_surface
+from mmgsd.scene.workspace.primitives import Solid, make_box, make_walls, merge, move
 
 KINDS = {"floor": 0.2, "table": 0.3, "board": 0.3, "tray": 0.06, "masked": 0.14}
 MASKS = ((0, 0, 0), (255, 255, 255))  # what is not the object, in pictures that somebody has masked

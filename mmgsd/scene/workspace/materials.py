@@ -5,9 +5,9 @@ from __future__ import annotations
 import bpy
 import numpy as np
 
-from mmgsd.scene import prints
-from mmgsd.scene.prints import Bytes, draw_other, draw_paint, to_linear
-from mmgsd.scene.textures import BACKGROUNDS, Shader
+from mmgsd.scene.textures import printed
+from mmgsd.scene.textures.printed import Bytes, draw_other, draw_paint, to_linear
+from mmgsd.scene.textures.procedural import BACKGROUNDS, Shader
 
 PREFIX = "view "  # of the names of what belongs to one view
 PROCEDURAL = {"wood": 0.4, "noise": 0.25, "tiles": 0.15, "checker": 0.08, "terrazzo": 0.12}
@@ -46,8 +46,8 @@ def paint_surface(rng: np.random.Generator, colour: Bytes, *, sheet: bool) -> tu
     shader = new_shader()
     kind = str(rng.choice(["plain", "procedural", "picture"], p=[0.4, 0.25, 0.35] if sheet else [0.3, 0.45, 0.25]))
     if kind == "picture":
-        name = str(rng.choice(list(prints.PICTURES), p=[0.3, 0.12, 0.1, 0.12, 0.08, 0.08, 0.2]))
-        pixels = prints.PICTURES[name](rng, colour)
+        name = str(rng.choice(list(printed.PICTURES), p=[0.3, 0.12, 0.1, 0.12, 0.08, 0.08, 0.2]))
+        pixels = printed.PICTURES[name](rng, colour)
         place = shader.node("TexCoord").outputs["Generated" if sheet else "Object"]
         scale = 1.0 if sheet else np.exp(rng.uniform(np.log(0.25), np.log(2.0)))
         surface = add_picture(shader, pixels, _map(rng, shader, place, scale, turned=not sheet))
@@ -93,10 +93,10 @@ def paint_object(rng: np.random.Generator, mesh: bpy.types.Object) -> tuple[Byte
         slot.material = slot.material or bpy.data.materials.new(f"object {i}")
         shader = Shader(slot.material)
         if "along" in mesh.data.attributes:
-            pixels, name = prints.paint_rope(rng, own)
+            pixels, name = printed.paint_rope(rng, own)
             surface, normal = _lay_rope(rng, shader, pixels), None
         else:
-            pixels, name = prints.paint_cloth(rng, own)
+            pixels, name = printed.paint_cloth(rng, own)
             surface, normal = _lay_cloth(rng, shader, pixels)
         if i == 0:
             mean = tuple(int(c) for c in pixels.mean(axis=(0, 1)))

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_sheet import grid_obj
+from test_planar_object import grid_obj
 
-from mmgsd.scene import meshes
-from mmgsd.scene.meshes import read_obj
+from mmgsd.scene.objects import meshes
+from mmgsd.scene.objects.meshes import read_obj
 
 GRID = grid_obj(20, 37)
 VERTICES = [line for line in GRID.splitlines() if line[0] == "v"]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mmgsd.scene.rope import grid_faces
+from mmgsd.scene.objects.rope import grid_faces
 
 
 @dataclass(frozen=True)

@@ -19,27 +19,27 @@ from dask.distributed import LocalCluster
 from mmgsd.config import RenderConfig
 from mmgsd.dataset import check_dataset, load_dataset
 from mmgsd.files import ForeignFileError, LockedError, locked, write_json
-from mmgsd.scene import rendering
-from mmgsd.scene.rendering import RenderError, plan_batches, render_batch, render_dataset
+from mmgsd.scene import stage
+from mmgsd.scene.stage import RenderError, plan_batches, render_batch, render_dataset
 
 CONFIG = RenderConfig(object="rope", train_images=3, test_images=2, views=1, samples=1, seed=5)
 # without a main guard: a plain script may render
 SCRIPT = """
 import sys
 from pathlib import Path
-from mmgsd.scene import rendering
+from mmgsd.scene import stage
 from mmgsd.config import RenderConfig
-rendering.IMAGES_A_BATCH = 1
+stage.IMAGES_A_BATCH = 1
 config = RenderConfig(object="rope", train_images=3, test_images=2, views=1, samples=1, seed=5)
 how = {"workers": int(sys.argv[2]), "scheduler": sys.argv[3]}
-rendering.render_dataset(config, Path(sys.argv[1]), progress=False, **how)
+stage.render_dataset(config, Path(sys.argv[1]), progress=False, **how)
 """
 
 
 def start(folder: Path, workers: int, scheduler: str = "", temporary: Path | None = None) -> subprocess.Popen:
     script = folder.parent / "render.py"
     script.write_text(SCRIPT)
-    path = str(Path(rendering.__file__).resolve().parents[2])
+    path = str(Path(stage.__file__).resolve().parents[2])
     env = {**os.environ, "PYTHONPATH": path, **({"TMPDIR": str(temporary)} if temporary else {})}
     command = [sys.executable, str(script), str(folder), str(workers), scheduler]
     return subprocess.Popen(command, env=env, start_new_session=True)
@@ -98,7 +98,7 @@ def test_a_lost_worker_of_a_foreign_cluster_costs_nothing_but_time(tmp_path: Pat
     undisturbed, disturbed = tmp_path / "undisturbed", tmp_path / "disturbed"
     assert start(undisturbed, 1).wait(300) == 0
     how = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
-    with rendering._unchanged_environment(), LocalCluster(n_workers=2, threads_per_worker=1, **how) as cluster:
+    with stage._unchanged_environment(), LocalCluster(n_workers=2, threads_per_worker=1, **how) as cluster:
         first = {worker.pid for worker in cluster.workers.values()}
         process = start(disturbed, 0, cluster.scheduler_address)
         killed = wait_for_rendering_worker(first)
@@ -137,7 +137,7 @@ def wait_for_rendering_worker(pids: set[int]) -> int:
 
 def test_a_folder_begun_with_another_configuration_is_not_mixed(tmp_path: Path) -> None:
     partial = tmp_path / "rope.partial"
-    write_json(partial / "config.json", rendering._describe(CONFIG))
+    write_json(partial / "config.json", stage._describe(CONFIG))
     with pytest.raises(ValueError, match="samples: 1 there, 2 asked for"):
         render_dataset(dataclasses.replace(CONFIG, samples=2), tmp_path / "rope", progress=False)
 
@@ -156,7 +156,7 @@ def test_modules_of_the_working_directory_are_not_taken_for_blenders(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PYTHONPATH", os.pathsep)  # twice the working directory
     job = {"config": {"samples": 0}, "split": "test", "episodes": [], "out": "a.zip"}
-    code, said = rendering.run_child(job, tmp_path)
+    code, said = stage.run_child(job, tmp_path)
     assert code == 1 and "samples must be" in said
 
 
@@ -166,20 +166,20 @@ def test_images_of_an_older_kind_of_cloth_are_not_taken_for_todays(tiny_dataset:
     (folder / "dataset.json").write_text(json.dumps(info))
     with pytest.raises(ValueError, match=r"scenes: 1 there, \d+ asked for.*overwrite=True"):
         render_dataset(config, folder)
-    info["versions"]["scenes"] = rendering.SCENES["cloth"]
+    info["versions"]["scenes"] = stage.SCENES["cloth"]
     (folder / "dataset.json").write_text(json.dumps(info))
     assert render_dataset(config, folder) == folder
 
 
 def test_a_workspace_is_another_data_set_and_a_plain_one_is_described_as_ever(tmp_path: Path) -> None:
-    assert rendering._describe(CONFIG) == {
+    assert stage._describe(CONFIG) == {
         "object": "rope", "train_images": 3, "test_images": 2, "views": 1, "samples": 1, "rotation_deg": 180.0,
         "ball": False, "seed": 5, "scenes": 1,
     }  # fmt: skip
-    (tmp_path / "config.json").write_text(json.dumps(rendering._describe(CONFIG)))
-    assert rendering._is_claimed(CONFIG, tmp_path)
+    (tmp_path / "config.json").write_text(json.dumps(stage._describe(CONFIG)))
+    assert stage._is_claimed(CONFIG, tmp_path)
     with pytest.raises(ValueError, match="scene: 'plain' there, 'workspace' asked for"):
-        rendering._is_claimed(dataclasses.replace(CONFIG, scene="workspace"), tmp_path)
+        stage._is_claimed(dataclasses.replace(CONFIG, scene="workspace"), tmp_path)
 
 
 def test_an_object_without_a_file_is_named(tmp_path: Path) -> None:
@@ -205,13 +205,13 @@ def test_a_changed_object_is_another_data_set(tmp_path: Path, monkeypatch: pytes
 def drawn(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Batches are drawn in milliseconds, without Blender; the list names the jobs' splits in turn."""
     asked: list[str] = []
-    monkeypatch.setattr(rendering, "IMAGES_A_BATCH", 1)
+    monkeypatch.setattr(stage, "IMAGES_A_BATCH", 1)
 
     def draw(job: dict, folder: Path) -> tuple[int, str]:
         asked.append(job["split"])
         return run_child(job, folder)
 
-    monkeypatch.setattr(rendering, "run_child", draw)
+    monkeypatch.setattr(stage, "run_child", draw)
     return asked
 
 
@@ -308,7 +308,7 @@ def test_batches_are_known_again_by_their_marks_where_the_claim_is_damaged(
 
 
 def test_a_killed_child_is_said_to_be_killed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rendering, "run_child", lambda job, folder: (-signal.SIGKILL, ""))
+    monkeypatch.setattr(stage, "run_child", lambda job, folder: (-signal.SIGKILL, ""))
     with pytest.raises(RenderError, match="ended by SIGKILL: memory may be short, so try fewer workers"):
         render_batch(next(iter(plan_batches(CONFIG).values())))
 
@@ -319,11 +319,11 @@ def test_stopping_says_what_is_kept_and_the_next_call_goes_on(
     def stop(*_: object) -> Path:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(rendering, "_assemble", stop)
+    monkeypatch.setattr(stage, "_assemble", stop)
     with pytest.raises(KeyboardInterrupt, match="5 of 5 batches are kept in .*rope.partial"):
         render(tmp_path / "rope")
     monkeypatch.undo()
-    monkeypatch.setattr(rendering, "IMAGES_A_BATCH", 1)
+    monkeypatch.setattr(stage, "IMAGES_A_BATCH", 1)
     assert len(load_dataset(render(tmp_path / "rope"))) == 3 and len(drawn) == 5
 
 
@@ -335,7 +335,7 @@ def test_nothing_listens_beyond_this_machine_while_it_renders(tmp_path: Path, mo
         listening.update(c.laddr.ip for c in there if c.status == psutil.CONN_LISTEN)
         return run_child(job, folder)
 
-    monkeypatch.setattr(rendering, "run_child", look)
+    monkeypatch.setattr(stage, "run_child", look)
     render(tmp_path / "rope")
     assert listening <= {"127.0.0.1", "::1"}
 
@@ -349,7 +349,7 @@ def test_as_many_children_as_cores_that_may_be_used(
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(cores)))
     monkeypatch.setattr(dask.system.psutil.Process, "cpu_affinity", lambda self: list(range(cores)))
     monkeypatch.setattr(dask.system, "_try_extract_cgroup_cpu_quota", lambda: quota)
-    assert rendering.cpu_count() == expected
+    assert stage.cpu_count() == expected
 
 
 def test_children_and_their_temporary_folders_go_with_a_killed_parent(tmp_path: Path) -> None:
@@ -366,5 +366,5 @@ def test_children_and_their_temporary_folders_go_with_a_killed_parent(tmp_path: 
     gone, alive = psutil.wait_procs(children, timeout=20)
     assert gone and not alive
     assert [path.name for path in temporary.glob(".mmgsd-batch*")]
-    with rendering.scratch_folder(temporary, "mmgsd-batch"):
+    with stage.scratch_folder(temporary, "mmgsd-batch"):
         assert len(list(temporary.glob(".mmgsd-batch*"))) == 1

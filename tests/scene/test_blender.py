@@ -19,8 +19,10 @@ bpy = pytest.importorskip("bpy")
 
 from mmgsd.config import RenderConfig  # noqa: E402
 from mmgsd.paths import find_root  # noqa: E402
-from mmgsd.scene import SceneError, cloth, episode, randomize, render, textures  # noqa: E402
-from mmgsd.scene.sheet import load_sheet  # noqa: E402
+from mmgsd.scene import SceneError, blender, episode, randomize  # noqa: E402
+from mmgsd.scene.objects import cloth  # noqa: E402
+from mmgsd.scene.objects.planar_object import load_sheet  # noqa: E402
+from mmgsd.scene.textures import procedural  # noqa: E402
 
 SIZE = (485, 485)
 
@@ -29,24 +31,24 @@ SIZE = (485, 485)
 def folded():
     """A folded cloth seen by one camera at 16 samples: (deformed, camera, image, mask)."""
     rng = np.random.default_rng(1)
-    scene = render.reset_scene()
+    scene = blender.reset_scene()
     vertices, _ = cloth.deform(rng, "corner")
     deformed = cloth.hand_over(vertices, {})
     floor = episode.add_floor()
-    render.setup_cycles(scene, SIZE, 16)
+    blender.setup_cycles(scene, SIZE, 16)
     camera, _ = randomize.draw_camera(rng, deformed.points, SIZE, 180.0)
-    render.place_camera(scene, camera)
+    blender.place_camera(scene, camera)
     randomize.draw_light(rng, scene)
     colour, _ = randomize.draw_background(rng, floor)
     randomize.draw_object_material(rng, deformed.mesh, colour)
-    image, mask = render.render_image(scene, seed=0)
+    image, mask = blender.render_image(scene, seed=0)
     return deformed, camera, image, mask
 
 
 def fill_triangles(mesh, camera):
     """The projected mesh filled at three times the resolution, taken at pixel centres: (H, W) bool."""
     mesh.data.calc_loop_triangles()
-    xy = camera.project(render.read_vertices(mesh.data))
+    xy = camera.project(blender.read_vertices(mesh.data))
     canvas = Image.new("1", (3 * SIZE[0], 3 * SIZE[1]))
     pen = ImageDraw.Draw(canvas)
     for triangle in mesh.data.loop_triangles:
@@ -72,7 +74,7 @@ def test_projected_outline_is_the_masks_outline(folded):
 
 def test_visible_points_lie_in_the_mask(folded):
     deformed, camera, _, mask = folded
-    visible = render.find_visible(deformed, render.build_bvh(deformed.mesh), camera)
+    visible = blender.find_visible(deformed, blender.build_bvh(deformed.mesh), camera)
     x, y = np.rint(camera.project(deformed.points[visible])).astype(int).T
     assert np.mean(distance_transform_edt(~mask)[y, x] <= 1.5) > 0.99
     assert 0.5 < visible.mean() < 1.0  # the corner hides a part of the cloth
@@ -88,11 +90,11 @@ def temporary(tmp_path, monkeypatch):
 
 
 def test_a_view_is_rendered_below_any_folder(temporary, monkeypatch):
-    monkeypatch.setattr(render, "MEMORY", temporary / "nowhere")
-    scene = render.reset_scene()
-    render.setup_cycles(scene, (16, 12), 1)
-    render.place_camera(scene, render.Camera(np.diag([16.0, 16.0, 1.0]), np.eye(4), (16, 12)))
-    assert render.render_image(scene, seed=0)[0].shape == (12, 16, 3)
+    monkeypatch.setattr(blender, "MEMORY", temporary / "nowhere")
+    scene = blender.reset_scene()
+    blender.setup_cycles(scene, (16, 12), 1)
+    blender.place_camera(scene, blender.Camera(np.diag([16.0, 16.0, 1.0]), np.eye(4), (16, 12)))
+    assert blender.render_image(scene, seed=0)[0].shape == (12, 16, 3)
     assert os.listdir(temporary) == [] and os.listdir(temporary.parent) == [temporary.name]
 
 
@@ -104,48 +106,48 @@ def test_a_view_goes_where_there_is_room(temporary, tmp_path, monkeypatch, writa
     memory = tmp_path / "memory"
     memory.mkdir()
     free = {memory: memory_mb, temporary: disk_mb}
-    monkeypatch.setattr(render, "MEMORY", memory)
+    monkeypatch.setattr(blender, "MEMORY", memory)
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
     monkeypatch.setattr(os, "access", lambda *_: writable)
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=1e6 * free[folder]))
     if expected:
-        assert render._find_room(3_000_000) == {"memory": memory, "disk": temporary}[expected]
+        assert blender._find_room(3_000_000) == {"memory": memory, "disk": temporary}[expected]
         return
     with pytest.raises(OSError, match="TMPDIR") as caught:
-        render._find_room(3_000_000)
+        blender._find_room(3_000_000)
     assert str(temporary) in str(caught.value) and str(memory) in str(caught.value)
 
 
 def test_a_folder_that_became_full_is_named(temporary, monkeypatch):
-    monkeypatch.setattr(render, "MEMORY", temporary / "nowhere")
+    monkeypatch.setattr(blender, "MEMORY", temporary / "nowhere")
     scene = SimpleNamespace(cycles=SimpleNamespace(), render=SimpleNamespace(resolution_x=16, resolution_y=12))
 
     def write_part(**_):
         Path(scene.render.filepath.replace("{{", "{").replace("}}", "}")).write_bytes(bytes(100))
 
     operators = SimpleNamespace(render=SimpleNamespace(render=write_part))
-    monkeypatch.setattr(render, "bpy", SimpleNamespace(ops=operators))
+    monkeypatch.setattr(blender, "bpy", SimpleNamespace(ops=operators))
     with pytest.raises(OSError, match="became full.*TMPDIR") as caught:
-        render.render_image(scene, seed=0)
+        blender.render_image(scene, seed=0)
     assert str(temporary) in str(caught.value)
 
 
 def test_flat_cloth_is_all_visible_and_its_corners_are_the_masks_corners():
     rng = np.random.default_rng(0)
-    scene = render.reset_scene()
+    scene = blender.reset_scene()
     deformed = cloth.hand_over(cloth.flat_vertices(), {})
-    render.setup_cycles(scene, SIZE, 4)
+    blender.setup_cycles(scene, SIZE, 4)
     camera, _ = randomize.draw_camera(rng, deformed.points, SIZE, 180.0)
-    render.place_camera(scene, camera)
+    blender.place_camera(scene, camera)
     randomize.draw_object_material(rng, deformed.mesh, (0.0, 0.0, 0.0, 1.0))
-    _, mask = render.render_image(scene, seed=0)
+    _, mask = blender.render_image(scene, seed=0)
     xy = camera.project(deformed.points).reshape(25, 25, 2)
     y, x = np.nonzero(mask)
     for corner in (xy[0, 0], xy[0, -1], xy[-1, 0], xy[-1, -1]):
         outwards = (corner - xy[12, 12]) / np.linalg.norm(corner - xy[12, 12])
         reach = (np.stack([x, y], axis=1) - corner) @ outwards
         assert abs(reach.max()) <= 2.5  # 1.5 px, and Catmull-Clark rounds the very corner
-    assert render.find_visible(deformed, render.build_bvh(deformed.mesh), camera).all()
+    assert blender.find_visible(deformed, blender.build_bvh(deformed.mesh), camera).all()
 
 
 @pytest.mark.parametrize("limit", [45.0, 180.0])
@@ -163,9 +165,10 @@ def test_turn_stays_within_the_limit(limit):
 
 
 def test_a_ray_that_meets_nothing_leaves_its_point_visible():
-    deformed, bvh = render.DeformedObject(None, np.array([[0.0, 0, 0]]), 0.01, {}), render.BVHTree.FromPolygons([], [])
+    deformed = blender.DeformedObject(None, np.array([[0.0, 0, 0]]), 0.01, {})
+    bvh = blender.BVHTree.FromPolygons([], [])
     camera, _ = randomize.draw_camera(np.random.default_rng(0), deformed.points, SIZE, 45.0)
-    assert render.find_visible(deformed, bvh, camera).tolist() == [True]
+    assert blender.find_visible(deformed, bvh, camera).tolist() == [True]
 
 
 def test_crossings_count_a_flap_pushed_through_the_cloth():
@@ -194,7 +197,7 @@ def test_points_that_no_camera_sees_are_given_up(place):
 
 def test_a_colour_further_away_than_any_is_given_up():
     with pytest.raises(SceneError, match="none of 1000 colours"):
-        textures.draw_contrasting(np.random.default_rng(0), (0.5, 0.5, 0.5, 1.0), distance=2.0, exempt=0.0)
+        procedural.draw_contrasting(np.random.default_rng(0), (0.5, 0.5, 0.5, 1.0), distance=2.0, exempt=0.0)
 
 
 def test_unknown_split_and_state_are_named():
@@ -236,10 +239,10 @@ def test_a_failed_job_says_why_and_leaves_nothing(tmp_path):
 @pytest.mark.parametrize("name", ["towel", "tshirt"])
 def test_a_sheets_points_are_its_vertices(name):
     sheet = load_sheet(find_root() / "data" / "objects" / f"{name}.json")
-    render.reset_scene()
+    blender.reset_scene()
     vertices, _ = cloth.deform(np.random.default_rng(4), "flat", sheet)
     mesh = cloth._add_rendered(vertices, sheet)
-    points = render.read_vertices(mesh.data)[: len(vertices)]
+    points = blender.read_vertices(mesh.data)[: len(vertices)]
     assert len(mesh.data.vertices) > 3 * len(vertices)
     inner = np.linalg.norm(points - vertices - [0, 0, np.mean(points[:, 2] - vertices[:, 2])], axis=1)
     assert np.median(inner) < 0.005  # subdivision smooths, it does not move points along the sheet
@@ -250,7 +253,7 @@ def test_a_tshirt_lies_on_either_face():
     sheet = load_sheet(find_root() / "data" / "objects" / "tshirt.json")
     fronts = set()
     for seed in range(6):
-        render.reset_scene()
+        blender.reset_scene()
         vertices, _ = cloth.deform(np.random.default_rng(seed), "flat", sheet)
         a, b, c = vertices[sheet.faces[0]]
         fronts.add(bool(np.cross(b - a, c - a)[2] > 0))
@@ -269,6 +272,6 @@ def test_views_of_a_tshirt_are_labelled():
 
 def test_every_view_has_a_picture_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     """Cycles takes a picture at the address of a removed one for that one, and shows what lay there before."""
-    monkeypatch.setattr(randomize, "BACKGROUNDS", {"clutter": textures.BACKGROUNDS["clutter"]})
+    monkeypatch.setattr(randomize, "BACKGROUNDS", {"clutter": procedural.BACKGROUNDS["clutter"]})
     episode.render_episode(RenderConfig(object="rope"), "train", 0, 3)
     assert len([image for image in bpy.data.images if image.name.startswith("clutter")]) == 3

@@ -14,9 +14,9 @@ from mathutils.bvhtree import BVHTree
 
 from mmgsd.config import RenderConfig
 from mmgsd.scene import SceneError
-from mmgsd.scene.meshes import SPACING
-from mmgsd.scene.render import DeformedObject, add_mesh, read_vertices
-from mmgsd.scene.sheet import Sheet
+from mmgsd.scene.blender import DeformedObject, add_mesh, read_vertices
+from mmgsd.scene.objects.meshes import SPACING
+from mmgsd.scene.objects.planar_object import Sheet
 from mmgsd.symmetry import grid_group
 
 SIDE = 37  # simulated vertices a side; with 49 a frame takes nearly twice as long

@@ -13,11 +13,20 @@ from mathutils.bvhtree import BVHTree
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
-from mmgsd.scene.grounds import Site, add_solid
-from mmgsd.scene.materials import paint_plain, paint_surface
-from mmgsd.scene.prints import Bytes, draw_paint, vary_paint
-from mmgsd.scene.render import Camera
-from mmgsd.scene.solids import Solid, make_box, make_capsule, make_lathe, make_sheet, make_tube, merge, move
+from mmgsd.scene.blender import Camera
+from mmgsd.scene.textures.printed import Bytes, draw_paint, vary_paint
+from mmgsd.scene.workspace.materials import paint_plain, paint_surface
+from mmgsd.scene.workspace.primitives import (
+    Solid,
+    make_box,
+    make_capsule,
+    make_lathe,
+    make_sheet,
+    make_tube,
+    merge,
+    move,
+)
+from mmgsd.scene.workspace.surfaces import Site, add_solid
 
 TRIES = 12  # to find a place
 OVER_COUNTS = (0.6, 0.3, 0.1)  # probabilities of 0, 1 and 2 things on the object

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from mmgsd.scene import maps
-from mmgsd.scene.textures import as_bytes, draw_clutter, draw_colour
+from mmgsd.scene import environment_maps
+from mmgsd.scene.textures.procedural import as_bytes, draw_clutter, draw_colour
 
 SIDE = 512  # px of a picture
 PHOTOGRAPHS = {  # package: files of its own
@@ -94,7 +94,7 @@ def load_photograph(name: str) -> np.ndarray:
 
 def paint_photograph(rng: np.random.Generator, colour: Bytes) -> np.ndarray:
     """A part of a photograph or of an environment map, mirrored, turned and tinted at random."""
-    image = maps.draw_part(rng, SIDE) if rng.random() < 0.3 else load_photograph(str(rng.choice(FILES)))
+    image = environment_maps.draw_part(rng, SIDE) if rng.random() < 0.3 else load_photograph(str(rng.choice(FILES)))
     side = int(rng.uniform(0.25, 1.0) * SIDE)
     left, top = rng.integers(0, SIDE - side + 1, size=2)
     part = np.rot90(image[top : top + side, left : left + side][:, :: rng.choice([-1, 1])], rng.integers(4))

@@ -47,7 +47,7 @@ from mmgsd.files import (
 )
 from mmgsd.paths import find_root
 from mmgsd.progress import ProgressBar
-from mmgsd.scene.sheet import Sheet, load_sheet
+from mmgsd.scene.objects.planar_object import Sheet, load_sheet
 from mmgsd.symmetry import GRID_GROUPS, LINE_GROUPS, load_group, load_mirror
 
 IMAGES_A_BATCH = 30  # a child process ends after about so many, which bounds its memory
@@ -85,7 +85,8 @@ def render_dataset(
     ``workers`` processes on this machine (0: one a core that it may use), or the ``scheduler`` of an existing Dask
     cluster by its address. Finished batches of a killed call are kept, damaged ones are rendered again.
 
-    Objects other than ``cloth`` and ``rope`` are read from ``data/objects/<name>.json`` (`mmgsd.scene.sheet`).
+    Objects other than ``cloth`` and ``rope`` are read from ``data/objects/<name>.json``
+    (`mmgsd.scene.objects.planar_object`).
 
     Raises ValueError where the folder holds another configuration, ForeignFileError where it holds anything but a data
     set, LockedError while another process renders into it.

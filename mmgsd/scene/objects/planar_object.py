@@ -30,7 +30,7 @@ from scipy.spatial import cKDTree
 
 from mmgsd.config import OBJECTS
 from mmgsd.files import read_json
-from mmgsd.scene.meshes import SPACING, UP, find_border, is_number, read_obj, read_outline, refine, triangulate
+from mmgsd.scene.objects.meshes import SPACING, UP, find_border, is_number, read_obj, read_outline, refine, triangulate
 from mmgsd.symmetry import SymmetryGroup
 
 TOLERANCE = 0.01  # m by which a symmetric shape may miss itself

@@ -16,12 +16,12 @@ import numpy as np
 from mathutils import Euler, Vector
 
 from mmgsd.config import RenderConfig
-from mmgsd.scene import maps, randomize, render
-from mmgsd.scene.cloth import EXTENT
-from mmgsd.scene.grounds import Site, draw_ground
-from mmgsd.scene.materials import paint_object, remove_view
-from mmgsd.scene.render import Camera, DeformedObject, View
-from mmgsd.scene.things import add_things
+from mmgsd.scene import blender, environment_maps, randomize
+from mmgsd.scene.blender import Camera, DeformedObject, View
+from mmgsd.scene.objects.cloth import EXTENT
+from mmgsd.scene.workspace.distractors import add_things
+from mmgsd.scene.workspace.materials import paint_object, remove_view
+from mmgsd.scene.workspace.surfaces import Site, draw_ground
 
 ABSENT = 0.035  # share of the views without the object, of those that nobody has masked
 MAX_TILT_DEG = 50.0
@@ -32,21 +32,21 @@ TRIES = 60  # to frame the object, before the camera looks straight down
 
 def render_view(
     rng: np.random.Generator, config: RenderConfig, size: tuple[int, int], scene: bpy.types.Scene,
-    deformed: DeformedObject, bvh: render.BVHTree,
+    deformed: DeformedObject, bvh: blender.BVHTree,
 ) -> View:  # fmt: skip
     """Furnish, light, render and label one view; nothing of it stays in the scene."""
     remove_view()
     camera, turn, tilt = draw_camera(rng, deformed, size, config.rotation_deg)
-    render.place_camera(scene, camera)
+    blender.place_camera(scene, camera)
     colour, texture = paint_object(rng, deformed.mesh)
     site = _describe_site(rng, config, deformed, camera, turn, colour)
     ground, walls, masked = draw_ground(rng, site)
     present = rng.random() >= ABSENT or masked is not None
-    visible = render.find_visible(deformed, bvh, camera)
+    visible = blender.find_visible(deformed, bvh, camera)
     visible, things = add_things(rng, site, camera, visible, beside=masked is None, walls=walls)
     light = draw_light(rng, scene, site.side, np.append(site.middle, 0.0))
     deformed.mesh.hide_render = not present
-    image, mask = render.render_image(scene, seed=int(rng.integers(2**31)))
+    image, mask = blender.render_image(scene, seed=int(rng.integers(2**31)))
     present = present and bool(mask.any())  # a near thing may hide all of it
     if masked is not None:
         image[~mask] = masked
@@ -163,16 +163,16 @@ def draw_light(rng: np.random.Generator, scene: bpy.types.Scene, side: float, ta
     mapped = rng.random() < MAPPED
     if mapped and rng.random() < 0.5:
         randomize.remove_lamp()
-        return maps.light_world(rng, scene, np.exp(rng.uniform(np.log(0.5), np.log(1.4))), _draw_tint(rng))
+        return environment_maps.light_world(rng, scene, np.exp(rng.uniform(np.log(0.5), np.log(1.4))), _draw_tint(rng))
     name = str(rng.choice(list(LIGHTS), p=[light.share for light in LIGHTS.values()]))
     light = LIGHTS[name]
     exposure, ambient = np.exp(rng.uniform(*np.log(light.exposure))), rng.uniform(*light.ambient)
     colour = _draw_tint(rng)
     sky = np.sqrt(colour) if rng.random() < 0.5 else colour
     if mapped:
-        name = f"{name}, {maps.light_world(rng, scene, exposure * ambient, sky)}"
+        name = f"{name}, {environment_maps.light_world(rng, scene, exposure * ambient, sky)}"
     else:
-        maps.remove_map(scene)
+        environment_maps.remove_map(scene)
         randomize.set_world(scene, (*np.clip(sky, 0, 2).tolist(), 1.0), exposure * ambient)
     elevation, azimuth = np.radians(rng.uniform(20, 85)), rng.uniform(0, 2 * np.pi)
     towards = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from mmgsd.paths import find_root
-from mmgsd.scene.meshes import SPACING
-from mmgsd.scene.sheet import Sheet, load_sheet, turn, turn_over
+from mmgsd.scene.objects.meshes import SPACING
+from mmgsd.scene.objects.planar_object import Sheet, load_sheet, turn, turn_over
 
 OBJECTS = find_root(Path(__file__).parent) / "data" / "objects"
 SQUARE = [[0, 0], [60, 0], [60, 60], [0, 60]]
