@@ -69,7 +69,7 @@ def test_commands_name_modules_notebooks_and_targets_that_exist(path: Path) -> N
         assert notebook == "NAME.ipynb" or (ROOT / "notebooks" / notebook).is_file(), notebook
     for target in re.findall(r"(?:^|`)make ([a-z][a-z-]*)", text, re.MULTILINE):
         assert target in targets, target
-    for file in re.findall(r"`((?:mmgsd|tests|data/(?:results|sample|weights|objects|packs))/[\w/.]*)`", text):
+    for file in re.findall(r"`((?:mmgsd|tests|data/(?:results|sample|weights|objects))/[\w/.]*)`", text):
         assert (ROOT / file).exists(), file
 
 
