@@ -22,7 +22,7 @@ from mmgsd.checks import read_count, read_flag
 from mmgsd.config import EvaluateConfig
 from mmgsd.dataset import Dataset, hold_out, join_datasets, load_dataset, load_parts, sample_pairs
 from mmgsd.learn.checkpoints import load_metadata, read_tensors, write_tensors
-from mmgsd.match.calibration import LEVELS, Calibration, Modes, compute_unit, parse_calibration
+from mmgsd.match.calibration import LEVELS, Calibration, Modes, compute_unit
 from mmgsd.match.matcher import Matcher
 from mmgsd.measure.questions import ask, choose_points, describe, measure_mean_error, model_answer
 from mmgsd.measure.reading import choose_reading
@@ -108,12 +108,6 @@ def _keep(weights: Path, found: dict[str, str]) -> Path:
     """Add to a file's metadata; its tensors stay."""
     tensors, note = read_tensors(weights)
     return write_tensors(weights, tensors, note | found)
-
-
-def read_calibration(weights: Path | str) -> Calibration | None:
-    """What a file of weights says its modes hold, None where it says nothing; ValueError where that is damaged."""
-    text = load_metadata(weights).get("calibration")
-    return None if text is None else parse_calibration(text)
 
 
 @own_numerics()
