@@ -72,6 +72,13 @@ class Camera:
     pose: np.ndarray  # (4, 4) camera to world
     size: tuple[int, int]  # (width, height) px
 
+    @classmethod
+    def build(cls, rotation: np.ndarray, place: np.ndarray, focal: float, size: tuple[int, int]) -> Camera:
+        """Of a rotation (3, 3) to the world, a place (3,) m, a focal length (px) and a size (width, height) px."""
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation, place
+        return cls(np.array([[focal, 0, (size[0] - 1) / 2], [0, focal, (size[1] - 1) / 2], [0, 0, 1]]), pose, size)
+
     def project(self, points: np.ndarray) -> np.ndarray:
         """Pixels (N, 2) of world points (N, 3) m."""
         local = (points - self.pose[:3, 3]) @ self.pose[:3, :3]
@@ -96,9 +103,26 @@ def add_mesh(name: str, vertices: np.ndarray, faces: np.ndarray) -> bpy.types.Ob
     """Link a new mesh of vertices (V, 3) m and faces (F, 3 or 4) into the scene."""
     mesh = bpy.data.meshes.new(name)
     mesh.from_pydata(vertices.tolist(), [], faces.tolist())
-    thing = bpy.data.objects.new(name, mesh)
-    bpy.context.collection.objects.link(thing)
-    return thing
+    return add_object(name, mesh)
+
+
+def add_object(name: str, data: bpy.types.Mesh | None) -> bpy.types.Object:
+    """Link a new object of some data, or an empty one, into the scene."""
+    added = bpy.data.objects.new(name, data)
+    bpy.context.collection.objects.link(added)
+    return added
+
+
+def add_floor(name: str, half: float, height: float = 0.0) -> bpy.types.Object:
+    """Link a level square, ``half`` m from its centre to each side, into the scene."""
+    corners = np.array([[-half, -half, height], [half, -half, height], [half, half, height], [-half, half, height]])
+    return add_mesh(name, corners, np.array([[0, 1, 2, 3]]))
+
+
+def add_attribute(mesh: bpy.types.Mesh, name: str, vectors: np.ndarray) -> None:
+    """Give a mesh's V vertices an attribute of that name, vectors (V, 3), which shaders can read."""
+    attribute = mesh.attributes.new(name, "FLOAT_VECTOR", "POINT")
+    attribute.data.foreach_set("vector", vectors.astype(np.float32).ravel())
 
 
 def setup_cycles(scene: bpy.types.Scene, size: tuple[int, int], samples: int) -> None:

@@ -11,7 +11,7 @@ from PIL import Image
 
 from mmgsd.scene import SceneError
 from mmgsd.scene.blender import encode_srgb
-from mmgsd.scene.randomize import set_world
+from mmgsd.scene.lighting import set_world
 
 NODE = "environment"  # of the world's shader, while a map lights it
 

@@ -13,6 +13,7 @@ from mmgsd.scene.blender import DeformedObject, View
 from mmgsd.scene.objects.planar_object import Sheet
 
 SPLITS = ("train", "test")
+FLOOR = 6.0  # m from its centre to each side
 
 
 def render_episode(
@@ -36,7 +37,7 @@ def render_episode(
         from mmgsd.scene.workspace.view import render_view
 
         return [render_view(rng, config, size, scene, deformed, bvh) for _ in range(n_views)]
-    floor = add_floor()
+    floor = blender.add_floor("floor", FLOOR)
     return [_render_view(rng, config, size, scene, deformed, floor, bvh) for _ in range(n_views)]
 
 
@@ -51,12 +52,6 @@ def build_object(rng: np.random.Generator, config: RenderConfig, sheet: Sheet | 
     else:
         from mmgsd.scene.objects.rope import build_rope as build
     return build(rng, config)
-
-
-def add_floor() -> bpy.types.Object:
-    """Add the plane z = 0, 12 m wide, to the current scene."""
-    corners = np.array([[-6, -6, 0], [6, -6, 0], [6, 6, 0], [-6, 6, 0]], dtype=float)
-    return blender.add_mesh("floor", corners, np.array([[0, 1, 2, 3]]))
 
 
 def _render_view(

@@ -24,7 +24,8 @@ from mmgsd.config import IMAGE_SIZE
 from mmgsd.fold.tasks import Task, find_task
 from mmgsd.scene import blender, randomize
 from mmgsd.scene.blender import Camera, DeformedObject
-from mmgsd.scene.episode import add_floor
+from mmgsd.scene.episode import FLOOR
+from mmgsd.scene.geometry import find_middle, spin
 from mmgsd.scene.objects import cloth, rope
 from mmgsd.scene.objects.meshes import SPACING
 from mmgsd.scene.objects.rope_shape import LENGTH, OwnPart, RopeShape, sample_rope
@@ -106,14 +107,13 @@ def _begin_rope(rng: np.random.Generator, about: dict[str, Any]) -> tuple[np.nda
     along /= np.linalg.norm(along)
     centre = shape.centre.copy()
     centre[:, :2] = centre[:, :2] @ np.array([[along[0], -along[1]], [along[1], along[0]]])
-    centre[:, :2] -= (centre[:, :2].min(0) + centre[:, :2].max(0)) / 2
+    centre[:, :2] -= find_middle(centre[:, :2])
     return centre, shape.thickness
 
 
 def _turn(rng: np.random.Generator, vertices: np.ndarray) -> np.ndarray:
     """Vertices (V, 3) turned about z by any angle, and a little aside."""
-    cosine, sine = np.cos(angle := rng.uniform(0, 2 * np.pi)), np.sin(angle)
-    turned = vertices @ np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]])
+    turned = vertices @ spin(rng.uniform(0, 2 * np.pi)).T
     turned[:, :2] += rng.uniform(-MAX_OFFSET, MAX_OFFSET, size=2)
     return turned
 
@@ -279,7 +279,7 @@ def _add_object(vertices: np.ndarray, about: dict[str, Any]) -> DeformedObject:
 
 def find_room(points: np.ndarray, task: Task) -> np.ndarray:
     """Places (K, 3) m that a task may need, around its object's first points (625, 3) m: seen, and nothing on them."""
-    middle = np.append((points[:, :2].min(0) + points[:, :2].max(0)) / 2, 0.0)
+    middle = np.append(find_middle(points[:, :2]), 0.0)
     if task.name == "straighten":  # the rope may come to lie in any direction
         angle = np.linspace(0, 2 * np.pi, 64, endpoint=False)
         rings = [np.stack([r * np.cos(angle), r * np.sin(angle), 0 * angle], axis=1) for r in (0.85, 0.6, 0.3)]
@@ -311,7 +311,7 @@ def _render(
     rng, masked = _stream(about, "look"), None
     if about["ground"] == "plain":
         randomize.draw_light(rng, scene)
-        colour, _ = randomize.draw_background(rng, add_floor())
+        colour, _ = randomize.draw_background(rng, blender.add_floor("floor", FLOOR))
         randomize.draw_object_material(rng, deformed.mesh, colour)
     else:
         masked = _furnish(rng, scene, deformed, room, camera, turn, about)

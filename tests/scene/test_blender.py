@@ -34,7 +34,7 @@ def folded():
     scene = blender.reset_scene()
     vertices, _ = cloth.deform(rng, "corner")
     deformed = cloth.hand_over(vertices, {})
-    floor = episode.add_floor()
+    floor = blender.add_floor("floor", episode.FLOOR)
     blender.setup_cycles(scene, SIZE, 16)
     camera, _ = randomize.draw_camera(rng, deformed.points, SIZE, 180.0)
     blender.place_camera(scene, camera)

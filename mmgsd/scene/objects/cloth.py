@@ -14,9 +14,10 @@ from mathutils.bvhtree import BVHTree
 
 from mmgsd.config import RenderConfig
 from mmgsd.scene import SceneError
-from mmgsd.scene.blender import DeformedObject, add_mesh, read_vertices
+from mmgsd.scene.blender import DeformedObject, add_attribute, add_floor, add_mesh, add_object, read_vertices
 from mmgsd.scene.objects.meshes import SPACING
 from mmgsd.scene.objects.planar_object import Sheet
+from mmgsd.scene.sampling import choose
 from mmgsd.symmetry import grid_group
 
 SIDE = 37  # simulated vertices a side; with 49 a frame takes nearly twice as long
@@ -53,14 +54,14 @@ def build_cloth(rng: np.random.Generator, config: RenderConfig) -> DeformedObjec
     """
     workspace = config.scene == "workspace"
     sheet, states = draw_rectangle(rng) if workspace else square_sheet(), WORKSPACE_STATES if workspace else STATES
-    state = str(rng.choice(list(states), p=list(states.values())))
+    state = choose(rng, states)
     vertices, frames = deform(rng, state, sheet)
     return hand_over(vertices, {"state": state, "physics_frames": frames}, sheet)
 
 
 def build_sheet(rng: np.random.Generator, sheet: Sheet) -> DeformedObject:
     """The same with a sheet of another shape, each of whose vertices is a material point."""
-    state = str(rng.choice(list(STATES), p=list(STATES.values())))
+    state = choose(rng, STATES)
     vertices, frames = deform(rng, state, sheet)
     mesh = _add_rendered(vertices, sheet)
     points = read_vertices(mesh.data)[: len(vertices)]  # subdivision appends the new ones
@@ -312,7 +313,7 @@ def simulate(
     scene.frame_start, scene.frame_end = 1, frames
     scene.frame_set(1)
     cloth = add_mesh("cloth physics", sheet.rest, sheet.faces)
-    floor = _add_floor(friction)
+    floor = _add_physics_floor(friction)
     _set_start(cloth, vertices)
     hooks = [_add_hook(cloth, grasp) for grasp in grasps]
     _add_physics(cloth, [grasp.vertex for grasp in grasps], frames)
@@ -332,8 +333,7 @@ def _set_start(cloth: bpy.types.Object, vertices: np.ndarray) -> None:
 
 
 def _add_hook(cloth: bpy.types.Object, grasp: Grasp) -> bpy.types.Object:
-    hook = bpy.data.objects.new("hook", None)
-    bpy.context.collection.objects.link(hook)
+    hook = add_object("hook", None)
     for frame, shift in enumerate(grasp.path, start=1):
         hook.location = shift
         hook.keyframe_insert("location", frame=frame)
@@ -360,9 +360,8 @@ def _add_physics(cloth: bpy.types.Object, pinned: list[int], frames: int) -> Non
     collision.collision_quality = 2  # with 1, layers pass through each other at ten times as many places
 
 
-def _add_floor(friction: float) -> bpy.types.Object:
-    corners = np.array([[-3, -3, 0], [3, -3, 0], [3, 3, 0], [-3, 3, 0]], dtype=float)
-    floor = add_mesh("physics floor", corners, np.array([[0, 1, 2, 3]]))
+def _add_physics_floor(friction: float) -> bpy.types.Object:
+    floor = add_floor("physics floor", 3.0)
     floor.modifiers.new("collision", "COLLISION")
     floor.collision.cloth_friction = friction
     floor.collision.thickness_outer = 0.005
@@ -383,11 +382,9 @@ def _add_rendered(vertices: np.ndarray, sheet: Sheet) -> bpy.types.Object:
     """A smooth static mesh lying on z = 0: of the square cloth's, 73 × 73 vertices."""
     coarse = add_mesh("cloth coarse", vertices, sheet.faces)
     if sheet.name == "cloth":  # textures in its own coordinates; they have a square's symmetry
-        rest = coarse.data.attributes.new("rest", "FLOAT_VECTOR", "POINT")
-        rest.data.foreach_set("vector", (flat_vertices() / EXTENT).astype(np.float32).ravel())
-    face = coarse.data.attributes.new("face", "FLOAT_VECTOR", "POINT")  # for pictures: 0 to 1 over the sheet
-    low, high = sheet.rest.min(axis=0), sheet.rest.max(axis=0)
-    face.data.foreach_set("vector", ((sheet.rest - low) / np.maximum(high - low, 1e-9)).astype(np.float32).ravel())
+        add_attribute(coarse.data, "rest", flat_vertices() / EXTENT)
+    low, size = sheet.rest.min(axis=0), np.ptp(sheet.rest, axis=0)
+    add_attribute(coarse.data, "face", (sheet.rest - low) / np.maximum(size, 1e-9))  # for images: 0 to 1 over it
     subdivision = coarse.modifiers.new("subdivision", "SUBSURF")
     subdivision.levels = 1
     mesh = bpy.data.meshes.new_from_object(coarse.evaluated_get(bpy.context.evaluated_depsgraph_get()))
@@ -397,9 +394,7 @@ def _add_rendered(vertices: np.ndarray, sheet: Sheet) -> bpy.types.Object:
     mesh.vertices.foreach_set("co", dense.astype(np.float32).ravel())
     mesh.shade_smooth()
     mesh.materials.append(None)
-    cloth = bpy.data.objects.new("cloth", mesh)
-    bpy.context.collection.objects.link(cloth)
-    return cloth
+    return add_object("cloth", mesh)
 
 
 def _order_row_major(mesh: bpy.types.Mesh) -> np.ndarray:

@@ -30,6 +30,7 @@ from scipy.spatial import cKDTree
 
 from mmgsd.config import OBJECTS
 from mmgsd.files import read_json
+from mmgsd.scene.geometry import spin
 from mmgsd.scene.objects.meshes import SPACING, UP, find_border, is_number, read_obj, read_outline, refine, triangulate
 from mmgsd.symmetry import SymmetryGroup
 
@@ -206,8 +207,7 @@ class Border:
 
 def turn(degrees: float) -> np.ndarray:
     """Rotation (3, 3) about the vertical."""
-    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    return spin(np.radians(degrees))
 
 
 def turn_over(degrees: float) -> np.ndarray:

@@ -13,7 +13,8 @@ import bpy
 import numpy as np
 
 from mmgsd.config import N_POINTS, RenderConfig
-from mmgsd.scene.blender import DeformedObject, add_mesh
+from mmgsd.scene.blender import DeformedObject, add_attribute, add_mesh
+from mmgsd.scene.geometry import measure_arc
 from mmgsd.scene.objects.rope_shape import LENGTH, OwnPart, RopeShape, resample, sample_rope
 
 RINGS = {"laid": 480, "braided": 400, "cable": 480}  # cross-sections of a strand
@@ -97,7 +98,7 @@ def build_parts(shape: RopeShape, lay: Lay) -> list[Part]:
     """All surfaces of the rope, in metres: strands, a braid's core, bound ends, ball."""
     path = _extend(resample(shape.centre, RINGS[lay.kind]), OVERHANG * shape.thickness)
     side, up = _frame(path)
-    arc = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))]) / shape.thickness
+    arc = measure_arc(path) / shape.thickness
     cap = _cap(arc)
     parts = []
     for strand in range(lay.strands):
@@ -233,8 +234,7 @@ def add_parts(parts: list[Part]) -> bpy.types.Object:
         start += rings * sides
     vertices = np.concatenate([part.vertices.reshape(-1, 3) for part in parts])
     rope = add_mesh("rope", vertices, np.concatenate(faces))
-    place = rope.data.attributes.new("along", "FLOAT_VECTOR", "POINT")  # for pictures: along each part, and around it
-    place.data.foreach_set("vector", np.concatenate(places).astype(np.float32).ravel())
+    add_attribute(rope.data, "along", np.concatenate(places))  # for images: along each part, and around it
     used, slots = np.unique(np.concatenate([[MAIN], *kinds]), return_inverse=True)
     for kind in used:
         rope.data.materials.append(bpy.data.materials.new(f"rope {kind}"))

@@ -9,6 +9,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
+from mmgsd.scene.geometry import measure_arc
+
 STEP = 1 / 3  # distance between particles, in diameters
 EXCLUDE = 2.2  # contact is not tested between parts nearer than this along the rope, in diameters
 REST_RADIUS = 2.0  # of the tightest bend a rope likes to keep, in diameters
@@ -79,7 +81,7 @@ def limit_bends(points: np.ndarray, stride: int) -> None:
 
 def near_pairs(points: np.ndarray, ball_radius: float) -> tuple[np.ndarray, np.ndarray]:
     """Pairs of particles (P, 2) that might touch, and the distance (P,) each must keep."""
-    arc = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    arc = measure_arc(points)
     pairs = cKDTree(points).query_pairs(1.3, output_type="ndarray")
     pairs = pairs[np.abs(arc[pairs[:, 0]] - arc[pairs[:, 1]]) > EXCLUDE]
     reach = np.full(len(pairs), CLEARANCE)

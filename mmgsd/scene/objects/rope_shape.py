@@ -15,7 +15,9 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
 from mmgsd.scene import SceneError
+from mmgsd.scene.geometry import find_middle, measure_arc
 from mmgsd.scene.objects.rope_relax import EXCLUDE, MIN_RADIUS, STEP, relax
+from mmgsd.scene.sampling import choose
 
 LENGTH = 1.6  # m, of every rope
 USUAL = 50  # diameters that a rope is long; longer ones bend in wider turns
@@ -60,7 +62,7 @@ def sample_rope(
     """
     if state is not None and state not in STATES:
         raise ValueError(f"state must be one of {', '.join(map(repr, STATES))}, got {state!r}")
-    state = state or str(rng.choice(list(STATES), p=list(STATES.values())))
+    state = state or choose(rng, STATES)
     ball_radius = rng.uniform(1.25, 1.75) * ball  # in diameters
     count = {"loops": int(rng.choice([1, 2, 3], p=[0.4, 0.35, 0.25])), "overhand knot": 3}.get(state, 0)
     # lazily: the next is drawn once one has failed
@@ -76,9 +78,9 @@ def sample_rope(
 def resample(points: np.ndarray, count: int) -> np.ndarray:
     """Equally spaced points (count, 3) on the smooth curve through ``points`` (N, 3), end to end."""
     for _ in range(2):  # the first pass measures arc length on chords, the second on a fine curve
-        arc = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+        arc = measure_arc(points)
         points = CubicSpline(arc, points)(np.linspace(0, arc[-1], max(count, 4 * len(points))))
-    arc = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    arc = measure_arc(points)
     return CubicSpline(arc, points)(np.linspace(0, arc[-1], count))
 
 
@@ -232,7 +234,7 @@ def _sample_knot(rng: np.random.Generator, total: float) -> tuple[np.ndarray, np
     t = np.linspace(-2.0, 2.0, 4001)
     template = np.stack([t**3 - 3 * t, t**4 - 4 * t**2], axis=1) * rng.uniform(1.3, 2.2)  # Shastri's long trefoil
     template *= np.sqrt(max(1.0, total / USUAL))
-    arc = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(template, axis=0), axis=1))])
+    arc = measure_arc(template)
     heading = np.interp(np.arange(0, arc[-1], STEP), arc, np.unwrap(np.arctan2(*np.gradient(template, axis=0).T[::-1])))
     knot = np.diff(heading) / STEP
     tails = np.maximum(10.0, (total - arc[-1]) * np.array([1, 1]) * (0.5 + rng.uniform(-0.3, 0.3) * np.array([1, -1])))
@@ -266,7 +268,7 @@ def _finish(points: np.ndarray, state: str, ball_radius: float) -> RopeShape:
     centre = resample(points, 625)
     thickness = LENGTH / np.linalg.norm(np.diff(centre, axis=0), axis=1).sum()
     centre = centre * thickness
-    centre[:, :2] -= (centre[:, :2].min(0) + centre[:, :2].max(0)) / 2
+    centre[:, :2] -= find_middle(centre[:, :2])
     pairs, _ = find_crossings(centre[:, :2])
     first_above = centre[pairs[:, 0], 2] > centre[pairs[:, 1], 2]
     crossings = np.where(first_above[:, None], pairs, pairs[:, ::-1])

@@ -16,7 +16,9 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from mmgsd.scene import environment_maps
-from mmgsd.scene.textures.procedural import as_bytes, draw_clutter, draw_colour
+from mmgsd.scene.sampling import log_uniform
+from mmgsd.scene.textures.colours import RGB, draw_colour, draw_other_rgb, draw_rgb, to_linear, to_srgb, vary_rgb
+from mmgsd.scene.textures.procedural import draw_clutter
 
 SIDE = 512  # px of a picture
 PHOTOGRAPHS = {  # package: files of its own
@@ -30,53 +32,7 @@ PHOTOGRAPHS = {  # package: files of its own
 }  # fmt: skip
 FILES = tuple(f"{folder}/{name}" for folder, names in PHOTOGRAPHS.items() for name in names)
 
-TABLES = (
-    (196, 154, 108), (160, 110, 66), (222, 188, 140), (110, 72, 46), (240, 240, 238), (225, 225, 228), (200, 200, 200),
-    (150, 152, 156), (100, 102, 106), (60, 62, 66), (24, 24, 26), (176, 164, 146), (60, 90, 70), (58, 78, 120),
-)  # fmt: skip
-
-Bytes = tuple[int, int, int]
-Draw = Callable[[np.random.Generator], Bytes]
-Paint = Callable[[np.random.Generator, Bytes], np.ndarray]
-
-
-def draw_paint(rng: np.random.Generator) -> Bytes:
-    """A colour as things have them: black, white and grey more often than `draw_colour` gives."""
-    kind = rng.random()
-    if kind < 0.12:
-        return (int(rng.integers(4, 40)),) * 3
-    if kind < 0.27:
-        return (int(rng.integers(215, 256)),) * 3
-    if kind < 0.37:
-        return (int(rng.integers(60, 200)),) * 3
-    return as_bytes(draw_colour(rng))
-
-
-def draw_table(rng: np.random.Generator) -> Bytes:
-    """A colour as tables and floors have them: wood, white, grey, black, or any."""
-    if rng.random() < 0.4:
-        return draw_paint(rng)
-    return vary_paint(rng, TABLES[rng.integers(len(TABLES))], 0.12)
-
-
-def draw_other(rng: np.random.Generator, other: Bytes, *, distance: float = 60.0, draw: Draw = draw_paint) -> Bytes:
-    """A colour at least ``distance`` (of 255) away from another, of a bounded number of draws."""
-    for _ in range(20):
-        colour = draw(rng)
-        if np.linalg.norm(np.subtract(colour, other)) >= distance:
-            return colour
-    return tuple(255 - c if abs(255 - 2 * c) > 40 else 0 for c in other)
-
-
-def vary_paint(rng: np.random.Generator, colour: Bytes, amount: float = 0.12) -> Bytes:
-    """A colour like another."""
-    shade = np.exp(rng.normal(scale=amount)) * np.exp(rng.normal(scale=amount / 3, size=3))
-    return tuple(int(c) for c in np.clip(np.array(colour) * shade + rng.normal(scale=6), 0, 255))
-
-
-def to_linear(colour: Bytes) -> tuple[float, float, float, float]:
-    """The same as linear RGBA."""
-    return (*((np.array(colour) / 255) ** 2.2).tolist(), 1.0)
+Paint = Callable[[np.random.Generator, RGB], np.ndarray]
 
 
 # Pictures. ------------------------------------------------------------------------------------------------------------
@@ -92,7 +48,7 @@ def load_photograph(name: str) -> np.ndarray:
     return np.asarray(image.crop((left, top, left + side, top + side)).resize((SIDE, SIDE)))
 
 
-def paint_photograph(rng: np.random.Generator, colour: Bytes) -> np.ndarray:
+def paint_photograph(rng: np.random.Generator, colour: RGB) -> np.ndarray:
     """A part of a photograph or of an environment map, mirrored, turned and tinted at random."""
     image = environment_maps.draw_part(rng, SIDE) if rng.random() < 0.3 else load_photograph(str(rng.choice(FILES)))
     side = int(rng.uniform(0.25, 1.0) * SIDE)
@@ -103,14 +59,14 @@ def paint_photograph(rng: np.random.Generator, colour: Bytes) -> np.ndarray:
     return np.asarray(Image.fromarray(np.ascontiguousarray(part)).resize((SIDE, SIDE)))
 
 
-def paint_collage(rng: np.random.Generator, colour: Bytes) -> np.ndarray:
+def paint_collage(rng: np.random.Generator, colour: RGB) -> np.ndarray:
     """Parts of photographs and areas of one colour over each other, of all sizes: edges at every scale."""
     image = Image.fromarray(paint_photograph(rng, colour))
     for _ in range(rng.integers(4, 40)):
-        reach = SIDE * np.exp(rng.uniform(np.log(0.03), np.log(0.4), size=2))
+        reach = SIDE * log_uniform(rng, 0.03, 0.4, 2)
         left, top = (rng.uniform(-0.2, 1.0, size=2) * SIDE).astype(int)
         size = tuple(np.maximum(2, reach.astype(int)).tolist())
-        part = Image.new("RGB", size, draw_paint(rng))
+        part = Image.new("RGB", size, draw_rgb(rng))
         if rng.random() < 0.5:
             part = Image.fromarray(paint_photograph(rng, colour)).resize(size)
         shape = Image.new("L", size, 0)
@@ -121,28 +77,28 @@ def paint_collage(rng: np.random.Generator, colour: Bytes) -> np.ndarray:
     return np.array(image)
 
 
-def paint_clutter(rng: np.random.Generator, colour: Bytes) -> np.ndarray:
+def paint_clutter(rng: np.random.Generator, colour: RGB) -> np.ndarray:
     """Polygons, discs and lines of random colours."""
     return np.array(draw_clutter(rng, to_linear(colour)))
 
 
-def paint_mosaic(rng: np.random.Generator, colour: Bytes) -> np.ndarray:
+def paint_mosaic(rng: np.random.Generator, colour: RGB) -> np.ndarray:
     """A grid of patches of many colours."""
     rows, columns = rng.integers(3, 14, size=2)
-    palette = np.array([draw_paint(rng) for _ in range(rng.integers(3, 9))] + [colour])
+    palette = np.array([draw_rgb(rng) for _ in range(rng.integers(3, 9))] + [colour])
     patches = palette[rng.integers(len(palette), size=(rows, columns))].astype(np.uint8)
     return np.array(Image.fromarray(patches).resize((SIDE, SIDE), Image.Resampling.NEAREST))
 
 
-def paint_page(rng: np.random.Generator, colour: Bytes) -> np.ndarray:
+def paint_page(rng: np.random.Generator, colour: RGB) -> np.ndarray:
     """A printed page: a heading, lines of text, boxes."""
     image = Image.new("RGB", (SIDE, SIDE), colour)
-    pen, ink = ImageDraw.Draw(image), draw_other(rng, colour, distance=120)
+    pen, ink = ImageDraw.Draw(image), draw_other_rgb(rng, colour, distance=120)
     y = rng.integers(20, 60)
     while y < SIDE - 40:
         size = int(rng.choice([14, 18, 40]))
         if rng.random() < 0.2:
-            pen.rectangle([30, y, rng.integers(100, SIDE - 30), y + 3 * size], fill=draw_paint(rng))
+            pen.rectangle([30, y, rng.integers(100, SIDE - 30), y + 3 * size], fill=draw_rgb(rng))
             y += 3 * size + 12
         else:
             pen.text((30, y), _write(rng, SIDE // size), fill=ink, font=_font(size))
@@ -150,19 +106,19 @@ def paint_page(rng: np.random.Generator, colour: Bytes) -> np.ndarray:
     return np.array(image)
 
 
-def paint_lines(rng: np.random.Generator, colour: Bytes) -> np.ndarray:
+def paint_lines(rng: np.random.Generator, colour: RGB) -> np.ndarray:
     """A cutting mat's or a graph paper's lines, both ways."""
     image = np.full((SIDE, SIDE, 3), colour, dtype=np.uint8)
-    step, line = int(rng.choice([16, 32, 64, 128])), draw_other(rng, colour, distance=40)
+    step, line = int(rng.choice([16, 32, 64, 128])), draw_other_rgb(rng, colour, distance=40)
     width = int(rng.integers(1, 4))
     for k in range(width):
         image[k::step], image[:, k::step] = line, line
     return image
 
 
-def paint_gradient(rng: np.random.Generator, colour: Bytes) -> np.ndarray:
+def paint_gradient(rng: np.random.Generator, colour: RGB) -> np.ndarray:
     """One colour turns into another."""
-    to, share = np.array(draw_paint(rng)), np.linspace(0, 1, SIDE)[:, None, None]
+    to, share = np.array(draw_rgb(rng)), np.linspace(0, 1, SIDE)[:, None, None]
     image = np.broadcast_to((1 - share) * np.array(colour) + share * to, (SIDE, SIDE, 3))
     return np.rot90(image, rng.integers(4)).astype(np.uint8)
 
@@ -186,7 +142,7 @@ def _font(size: int) -> ImageFont.ImageFont:
 # Cloth. ---------------------------------------------------------------------------------------------------------------
 
 
-def paint_cloth(rng: np.random.Generator, colour: Bytes) -> tuple[np.ndarray, str]:
+def paint_cloth(rng: np.random.Generator, colour: RGB) -> tuple[np.ndarray, str]:
     """The face of a cloth, edge to edge, and the name of its pattern; hems, embroidery and stickers on some."""
     name = str(rng.choice(list(FABRICS), p=list(SHARES.values())))
     image = Image.fromarray(np.ascontiguousarray(FABRICS[name](rng, colour)))
@@ -200,22 +156,22 @@ def paint_cloth(rng: np.random.Generator, colour: Bytes) -> tuple[np.ndarray, st
     return np.array(image), name
 
 
-def _plain(rng: np.random.Generator, colour: Bytes) -> np.ndarray:
+def _plain(rng: np.random.Generator, colour: RGB) -> np.ndarray:
     return np.full((SIDE, SIDE, 3), colour, dtype=np.uint8)
 
 
-def _mottled(rng: np.random.Generator, colour: Bytes) -> np.ndarray:
+def _mottled(rng: np.random.Generator, colour: RGB) -> np.ndarray:
     """Blotches from threads to stains, of one colour's shades."""
-    cells = int(np.exp(rng.uniform(np.log(6), np.log(250))))
+    cells = int(log_uniform(rng, 6, 250))
     noise = rng.integers(0, 256, size=(cells, cells), dtype=np.uint8)
     share = np.asarray(Image.fromarray(noise).resize((SIDE, SIDE), Image.Resampling.BICUBIC))[..., None] / 255
-    return ((1 - share) * np.array(colour) + share * np.array(vary_paint(rng, colour, 0.3))).astype(np.uint8)
+    return ((1 - share) * np.array(colour) + share * np.array(vary_rgb(rng, colour, 0.3))).astype(np.uint8)
 
 
-def _bands(rng: np.random.Generator, colour: Bytes) -> np.ndarray:
+def _bands(rng: np.random.Generator, colour: RGB) -> np.ndarray:
     """Colours (SIDE, 3) of stripes along a line, periodic or not."""
-    palette = [colour, draw_other(rng, colour)] + [draw_paint(rng) for _ in range(rng.integers(0, 3))]
-    count = int(np.exp(rng.uniform(np.log(3), np.log(40))))
+    palette = [colour, draw_other_rgb(rng, colour)] + [draw_rgb(rng) for _ in range(rng.integers(0, 3))]
+    count = int(log_uniform(rng, 3, 40))
     widths = rng.uniform(0.2, 1.0, size=count) ** 2
     order = np.arange(count) % len(palette) if rng.random() < 0.6 else rng.integers(len(palette), size=count)
     if rng.random() < 0.6:  # as regular as a loom's
@@ -224,44 +180,44 @@ def _bands(rng: np.random.Generator, colour: Bytes) -> np.ndarray:
     return np.array(palette)[order[np.searchsorted(edges, np.arange(SIDE) + 0.5).clip(0, count - 1)]]
 
 
-def _striped(rng: np.random.Generator, colour: Bytes) -> np.ndarray:
+def _striped(rng: np.random.Generator, colour: RGB) -> np.ndarray:
     image = np.broadcast_to(_bands(rng, colour)[:, None], (SIDE, SIDE, 3)).astype(np.uint8)
     return np.rot90(image, rng.integers(2))
 
 
-def _plaid(rng: np.random.Generator, colour: Bytes) -> np.ndarray:
+def _plaid(rng: np.random.Generator, colour: RGB) -> np.ndarray:
     across = _bands(rng, colour)
     along = across if rng.random() < 0.5 else _bands(rng, colour)
     return ((across[:, None] + along[None]) // 2).astype(np.uint8)
 
 
-def _printed(rng: np.random.Generator, colour: Bytes) -> np.ndarray:
+def _printed(rng: np.random.Generator, colour: RGB) -> np.ndarray:
     """A picture over all of the cloth."""
     names = ["photograph", "collage", "clutter", "mosaic", "page", "gradient"]
     return PICTURES[str(rng.choice(names, p=[0.35, 0.25, 0.12, 0.12, 0.08, 0.08]))](rng, colour)
 
 
-def _repeated(rng: np.random.Generator, colour: Bytes) -> np.ndarray:
+def _repeated(rng: np.random.Generator, colour: RGB) -> np.ndarray:
     """A small motif again and again."""
     side = int(rng.choice([32, 64, 128]))
     image = Image.new("RGB", (side, side), colour)
     pen = ImageDraw.Draw(image)
     for _ in range(rng.integers(1, 5)):
-        _draw_motif(rng, pen, rng.uniform(0.2, 0.8, size=2) * side, rng.uniform(0.06, 0.3) * side, draw_paint(rng))
+        _draw_motif(rng, pen, rng.uniform(0.2, 0.8, size=2) * side, rng.uniform(0.06, 0.3) * side, draw_rgb(rng))
     return np.tile(np.asarray(image), (SIDE // side, SIDE // side, 1))
 
 
-def _quilted(rng: np.random.Generator, colour: Bytes) -> np.ndarray:
+def _quilted(rng: np.random.Generator, colour: RGB) -> np.ndarray:
     """Panels with a border of their own on a ground of one colour."""
     image = Image.new("RGB", (SIDE, SIDE), colour)
-    pen, panel, frame = ImageDraw.Draw(image), draw_paint(rng), draw_other(rng, colour)
+    pen, panel, frame = ImageDraw.Draw(image), draw_rgb(rng), draw_other_rgb(rng, colour)
     rows, columns, gap = rng.integers(2, 6), rng.integers(1, 6), rng.uniform(0.03, 0.15)
     for row in range(rows):
         for column in range(columns):
             box = (np.array([column + gap, row + gap, column + 1 - gap, row + 1 - gap])
                    / [columns, rows, columns, rows] * SIDE)  # fmt: skip
             pen.rectangle(box.tolist(), fill=panel, outline=frame, width=int(rng.integers(3, 12)))
-            _draw_motif(rng, pen, (box[:2] + box[2:]) / 2, np.min(box[2:] - box[:2]) / 3.5, draw_paint(rng))
+            _draw_motif(rng, pen, (box[:2] + box[2:]) / 2, np.min(box[2:] - box[:2]) / 3.5, draw_rgb(rng))
     return np.array(image)
 
 
@@ -275,7 +231,7 @@ SHARES = {
 
 
 def _draw_motif(rng: np.random.Generator, pen: ImageDraw.ImageDraw, centre: np.ndarray, reach: float,
-                colour: Bytes) -> None:  # fmt: skip
+                colour: RGB) -> None:  # fmt: skip
     """A disc, a ring, a polygon, a cross or letters."""
     (x, y), kind = centre, rng.choice(["disc", "ring", "polygon", "cross", "letters"])
     box = [x - reach, y - reach, x + reach, y + reach]
@@ -294,25 +250,25 @@ def _draw_motif(rng: np.random.Generator, pen: ImageDraw.ImageDraw, centre: np.n
         pen.text((x - reach, y - reach / 2), _write(rng, 5), fill=colour, font=_font(size))
 
 
-def _hem(rng: np.random.Generator, pen: ImageDraw.ImageDraw, colour: Bytes) -> None:
+def _hem(rng: np.random.Generator, pen: ImageDraw.ImageDraw, colour: RGB) -> None:
     """A band along all four edges, or a braid of dashes."""
     out, width = int(rng.choice([0, rng.integers(0, 40)])), int(rng.integers(4, 34))
-    trim = draw_other(rng, colour)
+    trim = draw_other_rgb(rng, colour)
     pen.rectangle([out, out, SIDE - 1 - out, SIDE - 1 - out], outline=trim, width=width)
     if rng.random() < 0.4:
-        dash, second = int(rng.integers(6, 24)), draw_other(rng, trim)
+        dash, second = int(rng.integers(6, 24)), draw_other_rgb(rng, trim)
         for k in range(out, SIDE - out, 2 * dash):
             for box in ([k, out, k + dash, out + width], [k, SIDE - 1 - out - width, k + dash, SIDE - 1 - out]):
                 pen.rectangle(box, fill=second)
                 pen.rectangle([box[1], box[0], box[3], box[2]], fill=second)
 
 
-def _embroider(rng: np.random.Generator, pen: ImageDraw.ImageDraw, colour: Bytes) -> None:
+def _embroider(rng: np.random.Generator, pen: ImageDraw.ImageDraw, colour: RGB) -> None:
     """A logo of a few motifs somewhere on the cloth."""
     centre, reach = rng.uniform(0.12, 0.88, size=2) * SIDE, rng.uniform(0.02, 0.16) * SIDE
     for _ in range(rng.integers(1, 6)):
         offset = rng.uniform(-1, 1, size=2) * reach
-        _draw_motif(rng, pen, centre + offset, rng.uniform(0.3, 1.0) * reach, draw_other(rng, colour))
+        _draw_motif(rng, pen, centre + offset, rng.uniform(0.3, 1.0) * reach, draw_other_rgb(rng, colour))
 
 
 def _stick(rng: np.random.Generator, pen: ImageDraw.ImageDraw) -> None:
@@ -322,10 +278,10 @@ def _stick(rng: np.random.Generator, pen: ImageDraw.ImageDraw) -> None:
     places = [(near, near), (near, far), (far, near), (far, far)]
     if rng.random() < 0.6:
         places += [(half, near), (half, far), (near, half), (far, half), (half, half)]
-    same = draw_paint(rng) if rng.random() < 0.4 else None
+    same = draw_rgb(rng) if rng.random() < 0.4 else None
     for x, y in places:
         if rng.random() < 0.9:
-            fill, box = same or as_bytes(draw_colour(rng)), [x - reach, y - reach, x + reach, y + reach]
+            fill, box = same or to_srgb(draw_colour(rng)), [x - reach, y - reach, x + reach, y + reach]
             (pen.rectangle if rng.random() < 0.7 else pen.ellipse)(box, fill=fill)
 
 
@@ -334,19 +290,19 @@ def _stick(rng: np.random.Generator, pen: ImageDraw.ImageDraw) -> None:
 ROPE_LENGTH_PX, ROPE_ROUND_PX = 1024, 16
 
 
-def paint_rope(rng: np.random.Generator, colour: Bytes) -> tuple[np.ndarray, str]:
+def paint_rope(rng: np.random.Generator, colour: RGB) -> tuple[np.ndarray, str]:
     """The skin (16, 1024, 3) of a rope, along it and around it, and the name of its pattern."""
     image = np.full((ROPE_ROUND_PX, ROPE_LENGTH_PX, 3), colour, dtype=np.uint8)
     name = str(rng.choice(["plain", "flecked", "banded", "halves", "spiral"], p=[0.5, 0.16, 0.14, 0.1, 0.1]))
     along, around = np.arange(ROPE_LENGTH_PX), np.arange(ROPE_ROUND_PX)[:, None]
-    second = draw_other(rng, colour)
+    second = draw_other_rgb(rng, colour)
     if name == "flecked":
         coarse = rng.random((ROPE_ROUND_PX // 2, ROPE_LENGTH_PX // 4)) < rng.uniform(0.05, 0.4)
         image[np.kron(coarse, np.ones((2, 4), dtype=bool))] = second
     elif name == "banded":  # tape, marks, heat-shrink tubes
         for _ in range(rng.integers(1, 6)):
             start = rng.integers(ROPE_LENGTH_PX)
-            image[:, start : start + rng.integers(6, 60)] = draw_paint(rng)
+            image[:, start : start + rng.integers(6, 60)] = draw_rgb(rng)
     elif name == "halves":
         share = 1 / (1 + np.exp(-(along - rng.uniform(0.3, 0.7) * ROPE_LENGTH_PX) / rng.uniform(1, 150)))[:, None]
         image[:] = (1 - share) * np.array(colour) + share * np.array(second)

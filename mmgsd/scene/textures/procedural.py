@@ -1,4 +1,4 @@
-"""Colours and procedural textures of the object and of what it lies on, as shader nodes.
+"""Procedural textures of the object and of what it lies on, as shader nodes.
 
 Textures on the object are invariant under the symmetry of the plain object (all of a square's turns and flips) or live
 in world space anew in each view: a print would tell the corners apart.
@@ -6,51 +6,17 @@ in world space anew in each view: a print would tell the corners apart.
 
 from __future__ import annotations
 
-import colorsys
 from collections.abc import Callable
 
 import bpy
 import numpy as np
 from PIL import Image, ImageDraw
 
-from mmgsd.scene import SceneError
 from mmgsd.scene.blender import MASK_PASS
+from mmgsd.scene.sampling import log_uniform
+from mmgsd.scene.textures.colours import Colour, draw_colour, draw_contrasting, to_srgb, vary_colour
 
-Colour = tuple[float, float, float, float]  # linear RGBA
 CLUTTER_PX = 512
-COLOURS = 1000  # drawn at most for one that is unlike another
-
-
-# Colour. ------------------------------------------------------------------------------------------------------------
-
-
-def draw_colour(rng: np.random.Generator) -> Colour:
-    """Greys, pale and vivid colours, never black: linear RGBA."""
-    saturation = rng.choice([rng.uniform(0, 0.12), rng.uniform(0.1, 0.5), rng.uniform(0.5, 1.0)])
-    rgb = colorsys.hsv_to_rgb(rng.random(), saturation, rng.uniform(0.2, 0.98))
-    return (*(float(c) ** 2.2 for c in rgb), 1.0)
-
-
-def draw_contrasting(rng: np.random.Generator, other: Colour, *, distance: float = 0.25, exempt: float = 0.1) -> Colour:
-    """A colour at least ``distance`` (of display range) from ``other``, but for a share ``exempt`` of the draws.
-
-    SceneError where there is none so far away.
-    """
-    for _ in range(COLOURS):
-        colour = draw_colour(rng)
-        if rng.random() <= exempt or np.linalg.norm(_display(colour) - _display(other)) >= distance:
-            return colour
-    raise SceneError(f"none of {COLOURS} colours was {distance:g} of the display's range away from {other}")
-
-
-def _display(colour: Colour) -> np.ndarray:
-    return np.array(colour[:3]) ** (1 / 2.2)
-
-
-def _vary(rng: np.random.Generator, colour: Colour, amount: float) -> Colour:
-    """A colour near ``colour``."""
-    shade = np.exp(rng.normal(scale=amount)) * np.exp(rng.normal(scale=amount / 3, size=3))
-    return (*np.clip(np.array(colour[:3]) * shade, 0.01, 0.95).tolist(), 1.0)
 
 
 # Shader. ------------------------------------------------------------------------------------------------------------
@@ -105,10 +71,10 @@ def _plain(rng: np.random.Generator, shader: Shader, colour: Colour) -> object:
 def _mottled(rng: np.random.Generator, shader: Shader, colour: Colour) -> object:
     """Blotches in world space, of a size from threads to stains."""
     place = shader.node("TexCoord").outputs["Object"]
-    scale = np.exp(rng.uniform(np.log(3), np.log(120)))
+    scale = log_uniform(rng, 3, 120)
     inputs = {"Vector": shader.node("Mapping", {"Vector": place, "Location": rng.uniform(-50, 50, 3)}).outputs[0]}
     noise = shader.node("TexNoise", {**inputs, "Scale": scale, "Detail": 1.0}).outputs[0]
-    return shader.mix(_steeper(shader, noise), colour, _vary(rng, colour, 0.35))
+    return shader.mix(_steeper(shader, noise), colour, vary_colour(rng, colour, 0.35))
 
 
 def _steeper(shader: Shader, noise: object) -> bpy.types.NodeSocket:
@@ -128,7 +94,7 @@ def _woven(rng: np.random.Generator, shader: Shader, colour: Colour) -> object:
     turns = 2 * np.pi * rng.uniform(20, 60)
     waves = [shader.math("COSINE", shader.math("MULTIPLY", axis, turns)) for axis in _rest_axes(shader)]
     factor = shader.math("MULTIPLY_ADD", shader.math("MULTIPLY", *waves), 0.5, 0.5)
-    return shader.mix(factor, colour, _vary(rng, colour, 0.3))
+    return shader.mix(factor, colour, vary_colour(rng, colour, 0.3))
 
 
 def _gingham(rng: np.random.Generator, shader: Shader, colour: Colour) -> object:
@@ -165,16 +131,16 @@ def _ground_plain(rng: np.random.Generator, shader: Shader, colour: Colour, plac
 
 def _ground_noise(rng: np.random.Generator, shader: Shader, colour: Colour, place: object) -> object:
     """Stone, carpet, concrete."""
-    inputs = {"Vector": place, "Scale": np.exp(rng.uniform(np.log(2), np.log(60))), "Detail": 3.0}
+    inputs = {"Vector": place, "Scale": log_uniform(rng, 2, 60), "Detail": 3.0}
     noise = shader.node("TexNoise", inputs).outputs[0]
-    return shader.mix(_steeper(shader, noise), colour, _vary(rng, colour, 0.5))
+    return shader.mix(_steeper(shader, noise), colour, vary_colour(rng, colour, 0.5))
 
 
 def _ground_wood(rng: np.random.Generator, shader: Shader, colour: Colour, place: object) -> object:
     """Grain along one direction, cut into planks."""
     inputs = {"Vector": place, "Scale": rng.uniform(2, 10), "Distortion": rng.uniform(2, 8), "Detail Scale": 0.6}
     grain = shader.node("TexWave", inputs).outputs[1]
-    wood = shader.mix(grain, colour, _vary(rng, colour, 0.35))
+    wood = shader.mix(grain, colour, vary_colour(rng, colour, 0.35))
     planks = {"Vector": place, "Scale": rng.uniform(1, 3), "Color1": (1, 1, 1, 1), "Color2": (0.8, 0.8, 0.8, 1)}
     brick = shader.node("TexBrick", {**planks, "Mortar": (0.3, 0.3, 0.3, 1), "Mortar Size": 0.004, "Brick Width": 2.0})
     return shader.node("MixRGB", {0: 1.0, 1: wood, 2: brick.outputs[0]}, blend_type="MULTIPLY").outputs[0]
@@ -182,13 +148,13 @@ def _ground_wood(rng: np.random.Generator, shader: Shader, colour: Colour, place
 
 def _ground_tiles(rng: np.random.Generator, shader: Shader, colour: Colour, place: object) -> object:
     """Bricks or tiles with joints."""
-    inputs = {"Vector": place, "Color1": colour, "Color2": _vary(rng, colour, 0.25), "Mortar": draw_colour(rng)}
+    inputs = {"Vector": place, "Color1": colour, "Color2": vary_colour(rng, colour, 0.25), "Mortar": draw_colour(rng)}
     size = {"Scale": rng.uniform(1.5, 8), "Brick Width": rng.uniform(0.5, 1.5), "Row Height": 0.5}
     return shader.node("TexBrick", {**inputs, **size, "Mortar Size": rng.uniform(0.005, 0.03)}).outputs[0]
 
 
 def _ground_checker(rng: np.random.Generator, shader: Shader, colour: Colour, place: object) -> object:
-    inputs = {"Vector": place, "Color1": colour, "Color2": _vary(rng, colour, 0.7), "Scale": rng.uniform(3, 25)}
+    inputs = {"Vector": place, "Color1": colour, "Color2": vary_colour(rng, colour, 0.7), "Scale": rng.uniform(3, 25)}
     return shader.node("TexChecker", inputs).outputs[0]
 
 
@@ -211,11 +177,11 @@ def _ground_clutter(rng: np.random.Generator, shader: Shader, colour: Colour, pl
 
 def draw_clutter(rng: np.random.Generator, colour: Colour) -> Image.Image:
     """Polygons, discs and lines of random colours on ``colour``: an image of 512 × 512 px."""
-    image = Image.new("RGB", (CLUTTER_PX, CLUTTER_PX), as_bytes(colour))
+    image = Image.new("RGB", (CLUTTER_PX, CLUTTER_PX), to_srgb(colour))
     pen = ImageDraw.Draw(image)
     for _ in range(rng.integers(15, 90)):
-        centre, fill = rng.uniform(0, CLUTTER_PX, size=2), as_bytes(draw_colour(rng))
-        reach = np.exp(rng.uniform(np.log(6), np.log(110)))
+        centre, fill = rng.uniform(0, CLUTTER_PX, size=2), to_srgb(draw_colour(rng))
+        reach = log_uniform(rng, 6, 110)
         corners = [tuple(point) for point in centre + rng.uniform(-reach, reach, size=(rng.integers(3, 7), 2))]
         shape = rng.choice(["polygon", "disc", "line"])
         if shape == "polygon":
@@ -225,11 +191,6 @@ def draw_clutter(rng: np.random.Generator, colour: Colour) -> Image.Image:
         else:
             pen.line(corners, fill=fill, width=int(rng.integers(1, 9)))
     return image
-
-
-def as_bytes(colour: Colour) -> tuple[int, int, int]:
-    """sRGB, 0 to 255, of a linear colour."""
-    return tuple(int(255 * c) for c in _display(colour))
 
 
 Ground = Callable[[np.random.Generator, Shader, Colour, object], object]

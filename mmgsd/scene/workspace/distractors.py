@@ -14,7 +14,8 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
 from mmgsd.scene.blender import Camera
-from mmgsd.scene.textures.printed import Bytes, draw_paint, vary_paint
+from mmgsd.scene.sampling import log_uniform
+from mmgsd.scene.textures.colours import RGB, draw_rgb, vary_rgb
 from mmgsd.scene.workspace.materials import paint_plain, paint_surface
 from mmgsd.scene.workspace.primitives import (
     Solid,
@@ -33,7 +34,7 @@ OVER_COUNTS = (0.6, 0.3, 0.1)  # probabilities of 0, 1 and 2 things on the objec
 MOST_HIDDEN = 0.5  # share of the points seen that things may cover
 SKINS = ((236, 188, 160), (198, 134, 100), (141, 85, 54), (82, 50, 34), (60, 120, 200), (20, 20, 22))  # and gloves
 
-Part = tuple[Solid, Bytes, bool]  # a solid, its colour, and whether it may be printed upon
+Part = tuple[Solid, RGB, bool]  # a solid, its colour, and whether it may be printed upon
 Maker = Callable[[np.random.Generator], list[Part]]
 Place = Callable[[np.random.Generator, Site, list[Part]], list[Part] | None]
 
@@ -43,14 +44,14 @@ Place = Callable[[np.random.Generator, Site, list[Part]], list[Part] | None]
 
 def _make_box(rng: np.random.Generator) -> list[Part]:
     size = rng.uniform(0.04, 0.22, size=3) * (1, 1, 0.7)
-    return [(make_box(size, (0, 0, size[2] / 2)), draw_paint(rng), True)]
+    return [(make_box(size, (0, 0, size[2] / 2)), draw_rgb(rng), True)]
 
 
 def _make_disc(rng: np.random.Generator) -> list[Part]:
     """A plate, a lid, a roll of tape."""
     radius, height, hole = rng.uniform(0.02, 0.13), rng.uniform(0.003, 0.05), rng.choice([0.0, 0.7])
     profile = [(0, 0), (radius, 0), (radius, height), (hole * radius + 1e-4, height), (hole * radius + 1e-4, 0)]
-    return [(make_lathe(profile), draw_paint(rng), not hole)]
+    return [(make_lathe(profile), draw_rgb(rng), not hole)]
 
 
 def _make_mug(rng: np.random.Generator) -> list[Part]:
@@ -59,7 +60,7 @@ def _make_mug(rng: np.random.Generator) -> list[Part]:
     profile = [(0, 0), (radius, 0), (radius, height), (inner, height), (0.8 * inner, 0.3 * height), (0, 0.3 * height)]
     angle = np.linspace(-1.4, 1.4, 12)
     bow = np.stack([radius + 0.4 * height * np.cos(angle), 0 * angle, height * (0.5 + 0.3 * np.sin(angle))], axis=1)
-    colour = draw_paint(rng)
+    colour = draw_rgb(rng)
     handle = [(make_tube(bow, 0.12 * radius), colour, False)] if rng.random() < 0.6 else []
     return [(make_lathe(profile), colour, True), *handle]
 
@@ -68,15 +69,15 @@ def _make_book(rng: np.random.Generator) -> list[Part]:
     width, length, height = rng.uniform(0.12, 0.2), rng.uniform(0.18, 0.28), rng.uniform(0.008, 0.04)
     pages = make_box((width - 0.006, length - 0.008, height - 0.004), (0.002, 0, height / 2))
     cover = [make_box((width, length, 0.002), (0, 0, z)) for z in (0.001, height - 0.001)]
-    return [(pages, (235, 230, 215), False), *((lid, draw_paint(rng), True) for lid in cover)]
+    return [(pages, (235, 230, 215), False), *((lid, draw_rgb(rng), True) for lid in cover)]
 
 
 def _make_pen(rng: np.random.Generator) -> list[Part]:
     length, radius = rng.uniform(0.1, 0.22), rng.uniform(0.003, 0.009)
     half, cap = length / 2, rng.uniform(0, 1) * length - length / 2
     body = make_capsule((-half, 0, radius), (cap, 0, radius), radius)
-    return [(body, draw_paint(rng), False), (make_capsule((cap, 0, radius), (half, 0, radius), radius, radius / 2),
-                                             draw_paint(rng), False)]  # fmt: skip
+    return [(body, draw_rgb(rng), False), (make_capsule((cap, 0, radius), (half, 0, radius), radius, radius / 2),
+                                             draw_rgb(rng), False)]  # fmt: skip
 
 
 def _make_cord(rng: np.random.Generator) -> list[Part]:
@@ -84,14 +85,14 @@ def _make_cord(rng: np.random.Generator) -> list[Part]:
     radius, drift = rng.uniform(0.002, 0.007), rng.normal(scale=0.1, size=2)
     knots = np.cumsum(rng.normal(scale=0.22, size=(7, 2)) + drift, axis=0)
     path = CubicSpline(np.arange(7), knots - knots[3])(np.linspace(0, 6, 90))
-    return [(make_tube(np.column_stack([path, np.full(90, radius)]), radius, sides=7), draw_paint(rng), False)]
+    return [(make_tube(np.column_stack([path, np.full(90, radius)]), radius, sides=7), draw_rgb(rng), False)]
 
 
 def _make_textile(rng: np.random.Generator) -> list[Part]:
     """Another cloth, rippled."""
     width, length = rng.uniform(0.3, 1.2, size=2)
     ripple = 0.002 + rng.uniform(0.004, 0.03) * rng.random((9, 9))
-    return [(make_sheet(width, length, ripple), draw_paint(rng), True)]
+    return [(make_sheet(width, length, ripple), draw_rgb(rng), True)]
 
 
 def _make_weight(rng: np.random.Generator) -> list[Part]:
@@ -102,31 +103,31 @@ def _make_weight(rng: np.random.Generator) -> list[Part]:
 def _make_gripper(rng: np.random.Generator) -> list[Part]:
     """Two fingers, a palm and an arm, from the tips at the origin upwards."""
     gap, length = rng.uniform(0.005, 0.05), rng.uniform(0.05, 0.11)
-    thick, wide, dark = rng.uniform(0.008, 0.02), rng.uniform(0.015, 0.03), draw_paint(rng)
+    thick, wide, dark = rng.uniform(0.008, 0.02), rng.uniform(0.015, 0.03), draw_rgb(rng)
     fingers = [make_box((thick, wide, length), (s * (gap + thick) / 2, 0, length / 2)) for s in (-1, 1)]
     palm = make_box((0.09 + gap, wide * 2.2, 0.06), (0, 0, length + 0.03))
     heights = [(0, 0, length + z) for z in (0.05, 0.2, 0.25, 0.6, 1.2)]
-    arm, body = make_tube(heights, [0.035, 0.035, 0.05, 0.05, 0.05], sides=18), draw_paint(rng)
+    arm, body = make_tube(heights, [0.035, 0.035, 0.05, 0.05, 0.05], sides=18), draw_rgb(rng)
     parts = [(finger, dark, False) for finger in fingers]
-    return [*parts, (palm, body, False), (arm, vary_paint(rng, body, 0.2), False)]
+    return [*parts, (palm, body, False), (arm, vary_rgb(rng, body, 0.2), False)]
 
 
 def _make_tool(rng: np.random.Generator) -> list[Part]:
     """A stick, a rod, a spatula: a handle that comes from outside, and its head at the origin."""
     radius, head = rng.uniform(0.004, 0.018), rng.choice(["none", "blade", "ring"])
-    parts = [(make_capsule((0, 0, radius), (0, 0, 1.3), radius), draw_paint(rng), False)]
+    parts = [(make_capsule((0, 0, radius), (0, 0, 1.3), radius), draw_rgb(rng), False)]
     if head == "blade":
-        parts.append((make_box((rng.uniform(0.01, 0.08), 0.006, 0.1), (0, 0, 0.05)), draw_paint(rng), False))
+        parts.append((make_box((rng.uniform(0.01, 0.08), 0.006, 0.1), (0, 0, 0.05)), draw_rgb(rng), False))
     elif head == "ring":
         angle = np.linspace(0, 2 * np.pi, 20)
         ring = np.stack([0.03 * np.cos(angle), 0 * angle, 0.03 + 0.03 * np.sin(angle)], axis=1)
-        parts.append((make_tube(ring, 0.005), draw_paint(rng), False))
+        parts.append((make_tube(ring, 0.005), draw_rgb(rng), False))
     return parts
 
 
 def _make_hand(rng: np.random.Generator) -> list[Part]:
     """Fingers from their tips at the origin, a back and a forearm with a sleeve, upwards along z, flat across x."""
-    skin = vary_paint(rng, SKINS[rng.integers(len(SKINS))], 0.1)
+    skin = vary_rgb(rng, SKINS[rng.integers(len(SKINS))], 0.1)
     solids = []
     for k, length in enumerate((0.062, 0.078, 0.084, 0.075)):
         root, spread = (0.0, (k - 1.5) * 0.021, 0.09), rng.normal(scale=0.006)
@@ -137,7 +138,7 @@ def _make_hand(rng: np.random.Generator) -> list[Part]:
     back = make_tube([(0.008, 0, z) for z in (0.08, 0.1, 0.14, 0.17, 0.2)], [0.03, 0.042, 0.044, 0.036, 0.03], sides=16)
     back = Solid(back.vertices * (0.45, 1, 1), back.faces, True)
     arm = make_tube([(0.0, 0, z) for z in (0.19, 0.3, 0.6, 1.1)], [0.028, 0.036, 0.045, 0.055], sides=16)
-    sleeve = skin if rng.random() < 0.4 else draw_paint(rng)
+    sleeve = skin if rng.random() < 0.4 else draw_rgb(rng)
     return [*((solid, skin, False) for solid in (*solids, back)), (arm, sleeve, False)]
 
 
@@ -163,7 +164,7 @@ def add_things(rng: np.random.Generator, site: Site, camera: Camera, visible: np
     ``walls`` are solids that are there already; without ``over`` nothing lies on the object or reaches for it. What
     would hide too much, or stand before the lens, is left out.
     """
-    scale, names = np.exp(rng.uniform(np.log(0.5), np.log(1.6))) * site.side, []
+    scale, names = log_uniform(rng, 0.5, 1.6) * site.side, []
     left = visible & ~find_covered(walls, site.points, camera)
     for name, maker, place in _choose(rng, site, beside, over):
         for _ in range(TRIES):

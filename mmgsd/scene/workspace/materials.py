@@ -5,8 +5,9 @@ from __future__ import annotations
 import bpy
 import numpy as np
 
+from mmgsd.scene.sampling import choose, log_uniform
 from mmgsd.scene.textures import printed
-from mmgsd.scene.textures.printed import Bytes, draw_other, draw_paint, to_linear
+from mmgsd.scene.textures.colours import RGB, draw_other_rgb, draw_rgb, to_linear
 from mmgsd.scene.textures.procedural import BACKGROUNDS, Shader
 
 PREFIX = "view "  # of the names of what belongs to one view
@@ -41,7 +42,7 @@ def add_picture(shader: Shader, pixels: np.ndarray, place: object, *, repeat: bo
 # Around the object. ---------------------------------------------------------------------------------------------------
 
 
-def paint_surface(rng: np.random.Generator, colour: Bytes, *, sheet: bool) -> tuple[bpy.types.Material, str]:
+def paint_surface(rng: np.random.Generator, colour: RGB, *, sheet: bool) -> tuple[bpy.types.Material, str]:
     """A material of a floor, a table or, over all of it, of a ``sheet``; and the name of its texture."""
     shader = new_shader()
     kind = str(rng.choice(["plain", "procedural", "picture"], p=[0.4, 0.25, 0.35] if sheet else [0.3, 0.45, 0.25]))
@@ -49,17 +50,17 @@ def paint_surface(rng: np.random.Generator, colour: Bytes, *, sheet: bool) -> tu
         name = str(rng.choice(list(printed.PICTURES), p=[0.3, 0.12, 0.1, 0.12, 0.08, 0.08, 0.2]))
         pixels = printed.PICTURES[name](rng, colour)
         place = shader.node("TexCoord").outputs["Generated" if sheet else "Object"]
-        scale = 1.0 if sheet else np.exp(rng.uniform(np.log(0.25), np.log(2.0)))
+        scale = 1.0 if sheet else log_uniform(rng, 0.25, 2.0)
         surface = add_picture(shader, pixels, _map(rng, shader, place, scale, turned=not sheet))
     else:
-        name = "plain" if kind == "plain" else str(rng.choice(list(PROCEDURAL), p=list(PROCEDURAL.values())))
+        name = "plain" if kind == "plain" else choose(rng, PROCEDURAL)
         place = _map(rng, shader, shader.node("TexCoord").outputs["Object"], 1.0, turned=True)
         surface = BACKGROUNDS[name](rng, shader, to_linear(colour), place)
     shader.finish(surface, rng.uniform(0.4, 1.0), _draw_gloss(rng, 0.3), False)
     return shader.material, name
 
 
-def paint_plain(rng: np.random.Generator, colour: Bytes) -> bpy.types.Material:
+def paint_plain(rng: np.random.Generator, colour: RGB) -> bpy.types.Material:
     """A material of one colour, shining on some things."""
     shader = new_shader()
     shader.finish(to_linear(colour), rng.uniform(0.2, 1.0), _draw_gloss(rng, 0.4), False)
@@ -81,15 +82,15 @@ def _map(rng: np.random.Generator, shader: Shader, place: object, scale: float, 
 # The object. ----------------------------------------------------------------------------------------------------------
 
 
-def paint_object(rng: np.random.Generator, mesh: bpy.types.Object) -> tuple[Bytes, str]:
+def paint_object(rng: np.random.Generator, mesh: bpy.types.Object) -> tuple[RGB, str]:
     """Fill every material slot of the object anew; its mean colour, and the name of the main slot's pattern.
 
     Patterns break the symmetry of its colours, not that of its shape: they lie on the cloth or the rope itself.
     """
-    colour = draw_paint(rng)
+    colour = draw_rgb(rng)
     mean, names = colour, []
     for i, slot in enumerate(mesh.material_slots):
-        own = colour if i == 0 else draw_other(rng, colour, distance=40)
+        own = colour if i == 0 else draw_other_rgb(rng, colour, distance=40)
         slot.material = slot.material or bpy.data.materials.new(f"object {i}")
         shader = Shader(slot.material)
         if "along" in mesh.data.attributes:
@@ -117,13 +118,13 @@ def _lay_cloth(rng: np.random.Generator, shader: Shader, pixels: np.ndarray) -> 
     side = shader.node("NewGeometry").outputs["Backfacing"]
     kind = rng.random()
     if kind < 0.3:  # another face
-        front = shader.mix(side, front, to_linear(draw_paint(rng)))
+        front = shader.mix(side, front, to_linear(draw_rgb(rng)))
     elif kind < 0.5:  # a print that hardly comes through
         white = (*[float(rng.uniform(0.4, 0.9))] * 3, 1.0)
         front = shader.mix(shader.math("MULTIPLY", side, rng.uniform(0.3, 0.8)), front, white)
     if rng.random() < 0.5:
         return front, None
-    scale = np.exp(rng.uniform(np.log(40), np.log(220)))
+    scale = log_uniform(rng, 40, 220)
     noise = shader.node("TexNoise", {"Vector": place, "Scale": scale, "Detail": 1.0}).outputs[0]
     relief = {"Height": noise, "Strength": rng.uniform(0.3, 1.0), "Distance": rng.uniform(0.3, 1.2) / scale}
     return front, shader.node("Bump", relief).outputs[0]

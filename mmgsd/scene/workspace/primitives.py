@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mmgsd.scene.geometry import spin
 from mmgsd.scene.objects.rope import grid_faces
 
 
@@ -98,5 +99,4 @@ def merge(parts: list[Solid]) -> Solid:
 def move(solid: Solid, turn: float, place: tuple[float, float, float], *, lean: float = 0.0) -> Solid:
     """A solid that leans (rad) from z towards x, turned (rad) about z, then shifted to a place (3,) m."""
     tilt = np.array([[np.cos(lean), 0, np.sin(lean)], [0, 1, 0], [-np.sin(lean), 0, np.cos(lean)]])
-    spin = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
-    return Solid(solid.vertices @ (spin @ tilt).T + place, solid.faces, solid.smooth)
+    return Solid(solid.vertices @ (spin(turn) @ tilt).T + place, solid.faces, solid.smooth)

@@ -7,8 +7,10 @@ from dataclasses import dataclass
 import bpy
 import numpy as np
 
-from mmgsd.scene.blender import add_mesh
-from mmgsd.scene.textures.printed import Bytes, draw_other, draw_paint, draw_table, vary_paint
+from mmgsd.scene.blender import add_floor, add_mesh
+from mmgsd.scene.geometry import find_middle, spin
+from mmgsd.scene.sampling import choose
+from mmgsd.scene.textures.colours import RGB, draw_other_rgb, draw_rgb, draw_table_rgb, vary_rgb
 from mmgsd.scene.workspace.materials import PREFIX, paint_plain, paint_surface
 from mmgsd.scene.workspace.primitives import Solid, make_box, make_walls, merge, move
 
@@ -25,18 +27,18 @@ class Site:
     side: float  # of the cloth at rest, or what the rope spans
     turn: float  # rad, of the picture's axes about z
     seen: np.ndarray  # (K, 2) places on the ground that the picture shows
-    colour: Bytes  # mean of the object
+    colour: RGB  # mean of the object
     thickness: float  # of the object above its points
     slender: bool  # a rope: what looks like it must not lie about
 
     @property
     def middle(self) -> np.ndarray:
         """(2,) centre of the object's bounding box."""
-        return (self.points[:, :2].min(0) + self.points[:, :2].max(0)) / 2
+        return find_middle(self.points[:, :2])
 
     def span(self, turn: float) -> tuple[np.ndarray, np.ndarray]:
         """Centre (2,) and size (2,) of the object's bounding box along axes turned by ``turn``."""
-        axes = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+        axes = spin(-turn)[:2, :2]
         along = self.points[:, :2] @ axes.T
         low, high = along.min(0), along.max(0)
         return (low + high) / 2 @ axes, high - low
@@ -65,21 +67,21 @@ def add_plate(centre: np.ndarray, size: np.ndarray, turn: float, top: float, thi
     added.location, added.rotation_euler = (*centre, top), (0, 0, turn)
 
 
-def draw_ground(rng: np.random.Generator, site: Site) -> tuple[str, list[Solid], Bytes | None]:
+def draw_ground(rng: np.random.Generator, site: Site) -> tuple[str, list[Solid], RGB | None]:
     """Add what lies under the object; its kind, solids that may hide the object, and the mask's colour if masked."""
-    kind = str(rng.choice(list(KINDS), p=list(KINDS.values())))
+    kind = choose(rng, KINDS)
     if kind == "masked":
         colour = _draw_mask(rng, site.colour)
         _add_floor(paint_plain(rng, colour), -STEP)
         return kind, [], colour
     thick = float(rng.choice([0.0, 0.003, 0.02], p=[0.35, 0.35, 0.3]))
     walls = []
-    main, name = paint_surface(rng, draw_like(rng, site.colour, 0.18), sheet=kind in ("board", "tray"))
+    main, name = paint_surface(rng, draw_similar_rgb(rng, site.colour, 0.18), sheet=kind in ("board", "tray"))
     if kind == "floor":
         _add_floor(main, -thick - 12 * STEP)
     else:
         deep = 0.75 if kind == "table" else thick + 12 * STEP
-        _add_floor(paint_surface(rng, draw_table(rng), sheet=False)[0], -deep)
+        _add_floor(paint_surface(rng, draw_table_rgb(rng), sheet=False)[0], -deep)
         outline = _add_top(rng, site, kind, thick, main)
         walls = _add_walls(rng, outline) if kind == "tray" else []
     for level in range(int(rng.choice([0, 1, 2, 3], p=[0.35, 0.3, 0.2, 0.15]))):
@@ -89,25 +91,24 @@ def draw_ground(rng: np.random.Generator, site: Site) -> tuple[str, list[Solid],
     return f"{kind}, {name}", walls, None
 
 
-def draw_like(rng: np.random.Generator, colour: Bytes, share: float) -> Bytes:
+def draw_similar_rgb(rng: np.random.Generator, colour: RGB, share: float) -> RGB:
     """A colour like the object's in a ``share`` of the draws, else one unlike it."""
     if rng.random() < share:
-        return vary_paint(rng, colour, 0.06)
-    return draw_other(rng, colour, distance=70, draw=draw_table)
+        return vary_rgb(rng, colour, 0.06)
+    return draw_other_rgb(rng, colour, distance=70, draw=draw_table_rgb)
 
 
-def _draw_mask(rng: np.random.Generator, colour: Bytes) -> Bytes:
+def _draw_mask(rng: np.random.Generator, colour: RGB) -> RGB:
     """Black, white or any colour that the object has not."""
     for _ in range(8):
-        picked = MASKS[int(rng.random() < 0.3)] if rng.random() < 0.8 else draw_paint(rng)
+        picked = MASKS[int(rng.random() < 0.3)] if rng.random() < 0.8 else draw_rgb(rng)
         if np.linalg.norm(np.subtract(picked, colour)) > 70:
             return picked
     return MASKS[int(sum(colour) < 384)]
 
 
 def _add_floor(material: bpy.types.Material, height: float) -> None:
-    corners = np.array([[-15, -15, height], [15, -15, height], [15, 15, height], [-15, 15, height]])
-    add_solid(Solid(corners, np.array([[0, 1, 2, 3]])), material, "floor")
+    add_floor(f"{PREFIX}floor", 15.0, height).data.materials.append(material)
 
 
 def _add_top(rng: np.random.Generator, site: Site, kind: str, thick: float, material: bpy.types.Material) -> np.ndarray:
@@ -123,16 +124,16 @@ def _add_top(rng: np.random.Generator, site: Site, kind: str, thick: float, mate
     if kind != "table" and rng.random() < 0.55:
         size[:] = size.max()
     slack = 0.4 * np.maximum(size - site.span(turn)[1], 0.1 * site.side if thick < 0.01 and kind == "board" else 0.0)
-    spin = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-    centre = centre + spin @ (slack * rng.uniform(-1, 1, size=2))
+    axes = spin(turn)[:2, :2]
+    centre = centre + axes @ (slack * rng.uniform(-1, 1, size=2))
     add_plate(centre, size, turn, -4 * STEP, 0.035 if kind == "table" else max(thick, 2 * STEP), material)
     corners = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]]) * size
-    return centre + corners @ spin.T
+    return centre + corners @ axes.T
 
 
 def _add_walls(rng: np.random.Generator, outline: np.ndarray) -> list[Solid]:
     walls = make_walls(outline, -0.002, rng.uniform(0.01, 0.07))
-    return [add_solid(walls, paint_plain(rng, draw_paint(rng)), "walls")]
+    return [add_solid(walls, paint_plain(rng, draw_rgb(rng)), "walls")]
 
 
 def _add_sheet(rng: np.random.Generator, site: Site, top: float) -> None:
@@ -143,14 +144,14 @@ def _add_sheet(rng: np.random.Generator, site: Site, top: float) -> None:
     place = site.seen[rng.integers(len(site.seen))]
     if rng.random() < 0.35:
         place = site.middle + rng.uniform(-0.6, 0.6, size=2) * site.side
-    like = draw_like(rng, site.colour, 0.3)
+    like = draw_similar_rgb(rng, site.colour, 0.3)
     material = paint_surface(rng, like, sheet=True)[0] if rng.random() < 0.7 else paint_plain(rng, like)
     add_plate(place, size, site.draw_turn(rng), top, 3 * STEP, material)
 
 
 def _add_seams(rng: np.random.Generator, site: Site) -> None:
     """Gaps between boards or tape on the floor: long bars across the picture."""
-    material, turn = paint_plain(rng, draw_paint(rng)), site.draw_turn(rng)
+    material, turn = paint_plain(rng, draw_rgb(rng)), site.draw_turn(rng)
     width = float(rng.choice([0.004, 0.012, 0.05]))
     bars = [move(make_box((12, width, STEP / 2)), turn + rng.integers(2) * np.pi / 2, (*place, -STEP / 2))
             for place in site.seen[rng.integers(len(site.seen), size=rng.integers(1, 4))]]  # fmt: skip

@@ -13,12 +13,14 @@ import dataclasses
 
 import bpy
 import numpy as np
-from mathutils import Euler, Vector
+from mathutils import Euler
 
 from mmgsd.config import RenderConfig
-from mmgsd.scene import blender, environment_maps, randomize
+from mmgsd.scene import blender, environment_maps, lighting
 from mmgsd.scene.blender import Camera, DeformedObject, View
+from mmgsd.scene.geometry import compute_direction, find_middle
 from mmgsd.scene.objects.cloth import EXTENT
+from mmgsd.scene.sampling import log_uniform
 from mmgsd.scene.workspace.distractors import add_things
 from mmgsd.scene.workspace.materials import paint_object, remove_view
 from mmgsd.scene.workspace.surfaces import Site, draw_ground
@@ -98,7 +100,7 @@ def draw_camera(
         tilt = abs(rng.normal(scale=5.0)) if rng.random() < 0.35 else rng.uniform(0, MAX_TILT_DEG)
         tilt = min(tilt, MAX_TILT_DEG)
         fill = rng.uniform(0.2, 1.05) if rng.random() < 0.4 else rng.uniform(0.45, 0.95)
-        nearness = np.exp(rng.uniform(np.log(0.8), np.log(3.5)))
+        nearness = log_uniform(rng, 0.8, 3.5)
         camera = frame_points(rng, points, size, turn, tilt, fill, nearness)
         depth = (points - camera.pose[:3, 3]) @ camera.pose[:3, 2]
         wide = thin * camera.intrinsics[0, 0] / depth.max()
@@ -118,7 +120,7 @@ def frame_points(
     """
     down = np.array(Euler((np.pi + np.radians(tilt), 0.0, 0.0)).to_matrix())
     rotation = np.array(Euler((0.0, 0.0, turn)).to_matrix()) @ down
-    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    middle = find_middle(points)
     distance = max(0.5, nearness * np.ptp(points[:, :2], axis=0).max())
     local = (points - middle) @ rotation + (0, 0, distance)
     plane = local[:, :2] / local[:, 2:]
@@ -126,10 +128,7 @@ def frame_points(
     focal = fill * np.min(np.array(size) / (high - low))  # px
     slack = np.maximum(np.array(size) / focal - (high - low), 0) / 2
     aside = ((low + high) / 2 - rng.uniform(-shift, shift, size=2) * slack) * distance
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, middle + rotation @ np.array([*aside, -distance])
-    intrinsics = np.array([[focal, 0, (size[0] - 1) / 2], [0, focal, (size[1] - 1) / 2], [0, 0, 1]])
-    return Camera(intrinsics, pose, size)
+    return Camera.build(rotation, middle + rotation @ np.array([*aside, -distance]), focal, size)
 
 
 # Light. ---------------------------------------------------------------------------------------------------------------
@@ -162,32 +161,24 @@ def draw_light(rng: np.random.Generator, scene: bpy.types.Scene, side: float, ta
     """
     mapped = rng.random() < MAPPED
     if mapped and rng.random() < 0.5:
-        randomize.remove_lamp()
-        return environment_maps.light_world(rng, scene, np.exp(rng.uniform(np.log(0.5), np.log(1.4))), _draw_tint(rng))
+        lighting.remove_lamp()
+        return environment_maps.light_world(rng, scene, log_uniform(rng, 0.5, 1.4), _draw_tint(rng))
     name = str(rng.choice(list(LIGHTS), p=[light.share for light in LIGHTS.values()]))
     light = LIGHTS[name]
-    exposure, ambient = np.exp(rng.uniform(*np.log(light.exposure))), rng.uniform(*light.ambient)
+    exposure, ambient = log_uniform(rng, *light.exposure), rng.uniform(*light.ambient)
     colour = _draw_tint(rng)
     sky = np.sqrt(colour) if rng.random() < 0.5 else colour
     if mapped:
         name = f"{name}, {environment_maps.light_world(rng, scene, exposure * ambient, sky)}"
     else:
         environment_maps.remove_map(scene)
-        randomize.set_world(scene, (*np.clip(sky, 0, 2).tolist(), 1.0), exposure * ambient)
-    elevation, azimuth = np.radians(rng.uniform(20, 85)), rng.uniform(0, 2 * np.pi)
-    towards = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
-    near = light.width[1] < 1  # m, of a lamp; a sun's are degrees
-    data = randomize.new_lamp(scene, "AREA" if near else "SUN")
+        lighting.set_world(scene, (*np.clip(sky, 0, 2).tolist(), 1.0), exposure * ambient)
+    direction = compute_direction(np.radians(rng.uniform(20, 85)), rng.uniform(0, 2 * np.pi))
     width, distance = rng.uniform(*light.width), rng.uniform(0.8, 3.0) * max(side, 0.5)
-    energy = exposure * (1 - ambient) / np.sin(elevation) * np.pi
-    if near:
-        data.data.size = width * max(side, 0.5)
-        energy *= np.pi * distance**2
-    else:
-        data.data.angle = np.radians(width)
-    data.data.color, data.data.energy = np.clip(colour, 0, 2), energy
-    data.location = target + distance * towards
-    data.rotation_euler = Vector(towards).to_track_quat("Z", "Y").to_euler()
+    near = light.width[1] < 1  # m, of a lamp; a sun's are degrees
+    lamp = lighting.add_lamp(scene, *(("AREA", width * max(side, 0.5)) if near else ("SUN", np.radians(width))))
+    exposure *= 1 - ambient
+    lighting.aim_lamp(lamp, target, direction, distance, colour=np.clip(colour, 0, 2), exposure=exposure)
     return name
 
 
