@@ -10,27 +10,27 @@ import numpy as np
 from mmgsd.config import OBJECTS, SCENES, RenderConfig
 from mmgsd.scene import blender, randomize
 from mmgsd.scene.blender import DeformedObject, View
-from mmgsd.scene.objects.planar_object import Sheet
+from mmgsd.scene.objects.planar_object import PlanarObject
 
 SPLITS = ("train", "test")
 FLOOR = 6.0  # m from its centre to each side
 
 
 def render_episode(
-    config: RenderConfig, split: str, episode: int, n_views: int, sheet: Sheet | None = None
+    config: RenderConfig, split: str, episode: int, n_views: int, planar: PlanarObject | None = None
 ) -> list[View]:
-    """Create, populate, render and label ``n_views`` views of one deformation of the cloth, the rope or a ``sheet``.
+    """Create, populate, render and label ``n_views`` views of one deformation of the cloth, the rope or a ``planar``.
 
     The same arguments give the same pixels in any process. ValueError for an unknown split.
     """
     if split not in SPLITS:
         raise ValueError(f"split must be one of {', '.join(SPLITS)}, got {split!r}")
-    kind = OBJECTS.index(config.object) if sheet is None else zlib.crc32(sheet.name.encode())
+    kind = OBJECTS.index(config.object) if planar is None else zlib.crc32(planar.name.encode())
     around = [SCENES.index(config.scene)] if config.scene != "plain" else []  # the plain scene's stream is as it was
     rng = np.random.default_rng([config.seed, kind, SPLITS.index(split), episode, *around])
     scene = blender.reset_scene()
-    deformed = build_object(rng, config, sheet)
-    size = config.size if sheet is None else sheet.size
+    deformed = build_object(rng, config, planar)
+    size = config.size if planar is None else planar.size
     blender.setup_cycles(scene, size, config.samples)
     bvh = blender.build_bvh(deformed.mesh)
     if config.scene == "workspace":
@@ -41,12 +41,12 @@ def render_episode(
     return [_render_view(rng, config, size, scene, deformed, floor, bvh) for _ in range(n_views)]
 
 
-def build_object(rng: np.random.Generator, config: RenderConfig, sheet: Sheet | None = None) -> DeformedObject:
+def build_object(rng: np.random.Generator, config: RenderConfig, planar: PlanarObject | None = None) -> DeformedObject:
     """Add a randomly deformed object of the configured kind to the current scene."""
-    if sheet is not None:
-        from mmgsd.scene.objects.cloth import build_sheet
+    if planar is not None:
+        from mmgsd.scene.objects.cloth import build_planar_object
 
-        return build_sheet(rng, sheet)
+        return build_planar_object(rng, planar)
     if config.object == "cloth":
         from mmgsd.scene.objects.cloth import build_cloth as build
     else:

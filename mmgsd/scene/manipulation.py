@@ -31,10 +31,10 @@ from mmgsd.scene.objects.meshes import SPACING
 from mmgsd.scene.objects.rope_shape import LENGTH, OwnPart, RopeShape, sample_rope
 from mmgsd.scene.rope_pull import pull_rope
 from mmgsd.scene.state import State, read_state, write_state
-from mmgsd.scene.workspace.distractors import add_things
+from mmgsd.scene.workspace.distractors import add_distractors
 from mmgsd.scene.workspace.materials import paint_object
-from mmgsd.scene.workspace.surfaces import Site, draw_ground
-from mmgsd.scene.workspace.view import draw_light, find_seen, frame_points
+from mmgsd.scene.workspace.surfaces import Site, add_surfaces
+from mmgsd.scene.workspace.view import draw_light, frame_points, sample_ground_points
 
 SAMPLES = 1  # of Cycles, a pixel, as the rendered sets have
 MAX_OFFSET = 0.1  # m from the origin, along x and y, of a first state
@@ -121,13 +121,13 @@ def _turn(rng: np.random.Generator, vertices: np.ndarray) -> np.ndarray:
 # Acts. --------------------------------------------------------------------------------------------------------------
 
 
-def act(state: State, moves: Moves, mark: str) -> State:
+def act(state: State, moves: Moves, job_hash: str) -> State:
     """The next look, after all ``moves`` (px) were made at once.
 
     A ray that misses the object grasps nothing. What physics spoils is said in the new state's ``fault``; a state that
     has one already stays as it is.
     """
-    about = state.about | {"look": state.about["look"] + 1, "mark": mark}
+    about = state.about | {"look": state.about["look"] + 1, "mark": job_hash}
     if about["fault"]:
         return dataclasses.replace(state, about=about)
     camera = Camera(state.intrinsics, state.camera_pose, state.mask.shape[::-1])
@@ -149,7 +149,7 @@ def find_cloth_fault(vertices: np.ndarray) -> str:
     """What physics did to a cloth (V, 3) m that no cloth would bear; empty where nothing."""
     if not np.isfinite(vertices).all():
         return "nowhere"
-    return _find_stretch(cloth.measure_stretch(cloth.square_sheet(), vertices))
+    return _find_stretch(cloth.measure_stretch(cloth.square_cloth(), vertices))
 
 
 def find_rope_fault(centre: np.ndarray) -> str:
@@ -170,23 +170,23 @@ def move_cloth(vertices: np.ndarray, grasps: Sequence[tuple[Sequence[int], np.nd
     """
     if not grasps:
         return vertices
-    sheet = cloth.square_sheet()
+    planar = cloth.square_cloth()
     furthest = max(np.linalg.norm(shift) for _, shift in grasps)
-    frames, held = LEAST_FRAMES + int(FRAMES_A_METRE * furthest), {}
+    frames, grasped = LEAST_FRAMES + int(FRAMES_A_METRE * furthest), {}
     for group, shift in grasps:
         lift, low = max(0.05, LIFT * np.linalg.norm(shift)), vertices[group, 2].min()
         path = cloth.arc_path(np.append(shift, LAID_AT - low), lift, frames)
-        held |= {vertex: cloth.Grasp(vertex, path) for vertex in group if vertex not in held}
-    carried = cloth.simulate(sheet, vertices, list(held.values()), frames, friction=FRICTION)
+        grasped |= {vertex: cloth.Grasp(vertex, path) for vertex in group if vertex not in grasped}
+    carried = cloth.simulate(planar, vertices, list(grasped.values()), frames, friction=FRICTION)
     if not np.isfinite(carried).all():
         return carried
-    return cloth.simulate(sheet, carried, [], SETTLE_FRAMES, friction=FRICTION)
+    return cloth.simulate(planar, carried, [], SETTLE_FRAMES, friction=FRICTION)
 
 
 def _grasp_cloth(vertices: np.ndarray, camera: Camera, moves: Moves) -> list[tuple[list[int], np.ndarray]]:
     """Vertices that each gripper takes, and by what shift (2,) m it carries them; none where its ray misses."""
     lying = vertices + (0, 0, 0.001 - vertices[:, 2].min())  # as it is rendered
-    faces, grasps = cloth.square_sheet().faces, []
+    faces, grasps = cloth.square_cloth().faces, []
     tree = BVHTree.FromPolygons(lying.tolist(), faces.tolist())
     for pick, place in moves:
         hit, _, face, _ = tree.ray_cast(Vector(camera.pose[:3, 3]), Vector(cast_ray(camera, pick)))
@@ -243,9 +243,9 @@ def meet_table(camera: Camera, xy: Sequence[float]) -> np.ndarray | None:
 # Looks. -------------------------------------------------------------------------------------------------------------
 
 
-def look_again(state: State, again: int, mark: str) -> State:
+def look_again(state: State, again: int, job_hash: str) -> State:
     """The same state, seen by the camera of another number than the rollout's own, which is 0; at rest meanwhile."""
-    about = state.about | {"again": again, "mark": mark}
+    about = state.about | {"again": again, "mark": job_hash}
     if about["fault"]:
         return dataclasses.replace(state, about=about)
     return _look(state.vertices, state.first, about)
@@ -270,7 +270,7 @@ def _look(vertices: np.ndarray, first: np.ndarray | None, about: dict[str, Any])
 
 def _add_object(vertices: np.ndarray, about: dict[str, Any]) -> DeformedObject:
     if about["object"] == "cloth":
-        return cloth.hand_over(vertices, {})
+        return cloth.add_cloth(vertices, {})
     thickness = about["thickness"]
     shape = RopeShape(vertices, thickness, about["start"], np.empty((0, 2), dtype=int), 0.0)
     mesh = rope.add_parts(rope.build_parts(shape, rope.draw_lay(_stream(about, "lay"))))
@@ -329,10 +329,10 @@ def _furnish(
     colour, _ = paint_object(rng, deformed.mesh)
     slender = about["object"] == "rope"
     side = float(np.ptp(room[:, :2], axis=0).max()) if slender else cloth.EXTENT
-    site = Site(room, side, turn, find_seen(rng, camera), colour, about["thickness"] / 2, slender)
-    _, walls, masked = draw_ground(rng, site)
+    site = Site(room, side, turn, sample_ground_points(rng, camera), colour, about["thickness"] / 2, slender)
+    _, walls, masked = add_surfaces(rng, site)
     free = np.ones(len(room), dtype=bool)
-    add_things(rng, site, camera, free, beside=masked is None, walls=walls, over=False)
+    add_distractors(rng, site, camera, free, beside=masked is None, walls=walls, over=False)
     draw_light(rng, scene, side, np.append(site.middle, 0.0))
     return masked
 

@@ -47,7 +47,7 @@ from mmgsd.files import (
 )
 from mmgsd.paths import find_root
 from mmgsd.progress import ProgressBar
-from mmgsd.scene.objects.planar_object import Sheet, load_sheet
+from mmgsd.scene.objects.planar_object import PlanarObject, load_planar_object
 from mmgsd.symmetry import GRID_GROUPS, LINE_GROUPS, load_group, load_mirror
 
 IMAGES_A_BATCH = 30  # a child process ends after about so many, which bounds its memory
@@ -106,7 +106,7 @@ def render_dataset(
         jobs = {name: job for name, job in plan_batches(config).items() if job["split"] == "test" or not only_test}
         if overwrite:
             remove_folder(partial, _is_batch_file)
-        with saying_what_stays(lambda: _describe_kept(partial, jobs)):
+        with saying_what_stays(lambda: _describe_finished(partial, jobs)):
             _render_missing(config, jobs, partial, workers, scheduler, progress)
             replace_folder(_assemble(config, partial, list(jobs)), folder, find_owner(folder))
         if not only_test:
@@ -138,28 +138,29 @@ def _is_batch_file(path: Path) -> bool:
     return any(pattern.fullmatch(first) for pattern in (BATCH, ASIDE))
 
 
-def _describe_kept(partial: Path, jobs: dict[str, dict]) -> str:
-    kept = sum((partial / f"{name}.zip").is_file() for name in jobs)
-    return f"rendering was stopped; {kept} of {len(jobs)} batches are kept in {partial}: call again without overwrite"
+def _describe_finished(partial: Path, jobs: dict[str, dict]) -> str:
+    done = sum((partial / f"{name}.zip").is_file() for name in jobs)
+    return f"rendering was stopped; {done} of {len(jobs)} batches are kept in {partial}: call again without overwrite"
 
 
-def load_object(config: RenderConfig) -> Sheet | None:
-    """The sheet that an object's file describes; None for the cloth and the rope, which need none."""
-    return None if config.object in OBJECTS else load_sheet(find_root() / "data" / "objects" / f"{config.object}.json")
+def load_object(config: RenderConfig) -> PlanarObject | None:
+    """What an object's file describes; None for the cloth and the rope, which need none."""
+    path = find_root() / "data" / "objects" / f"{config.object}.json"
+    return None if config.object in OBJECTS else load_planar_object(path)
 
 
 def plan_batches(config: RenderConfig) -> dict[str, dict]:
     """The jobs of a data set by name; they depend on the configuration alone, never on who renders them."""
-    jobs, sheet, images_of = {}, load_object(config), _describe(config)
-    described = None if sheet is None else sheet.to_dict()
+    jobs, planar, configuration = {}, load_object(config), _describe(config)
+    described = None if planar is None else planar.to_dict()
     for split, images in zip(SPLITS, (config.train_images, config.test_images), strict=True):
         views = [min(config.views, images - start) for start in range(0, images, config.views)]
         batch = max(1, IMAGES_A_BATCH // config.views)
         for start in range(0, len(views), batch):
             episodes = [[start + i, n] for i, n in enumerate(views[start : start + batch])]
             job = {"config": to_dict(config), "split": split, "episodes": episodes, "sheet": described}
-            mark = hashlib.sha256(json.dumps([images_of, split, episodes]).encode()).hexdigest()
-            jobs[f"{split}_{start:06d}"] = {**job, "mark": mark}
+            job_hash = hashlib.sha256(json.dumps([configuration, split, episodes]).encode()).hexdigest()
+            jobs[f"{split}_{start:06d}"] = {**job, "mark": job_hash}
     return jobs
 
 
@@ -167,9 +168,9 @@ def render_batch(job: dict) -> bytes:
     """Render one job in a child process and return its zip file; RenderError where the child fails."""
     with scratch_folder(Path(tempfile.gettempdir()), "mmgsd-batch") as folder:
         out = folder / "batch.zip"
-        code, said = run_child({**job, "out": str(out), "parent": os.getpid()}, folder)
+        code, stderr = run_child({**job, "out": str(out), "parent": os.getpid()}, folder)
         if code or not out.is_file():
-            raise RenderError(f"rendering {job['split']} {job['episodes']} {explain(code)}:\n{said[-2000:]}")
+            raise RenderError(f"rendering {job['split']} {job['episodes']} {describe_exit(code)}:\n{stderr[-2000:]}")
         return out.read_bytes()
 
 
@@ -187,14 +188,14 @@ def run_child(job: dict, folder: Path) -> tuple[int, str]:
     ) as child:
         _children.add(child)
         try:
-            _, said = child.communicate(json.dumps(job))
+            _, stderr = child.communicate(json.dumps(job))
         finally:
             _children.discard(child)
             child.kill()
-    return child.returncode, said
+    return child.returncode, stderr
 
 
-def explain(code: int) -> str:
+def describe_exit(code: int) -> str:
     """How a child ended, from its exit code."""
     if code >= 0:
         return "failed"
@@ -281,18 +282,18 @@ def _is_claimed(config: RenderConfig, partial: Path) -> bool:
 def _is_whole(path: Path, job: dict, claimed: bool) -> bool:
     """Whether a job's batch is there; one that is damaged, or of unknown origin, is set aside.
 
-    A batch carries its job's mark. One of before there were marks is trusted where the folder names the configuration.
+    A batch carries its job's hash. One of before there were any is trusted where the folder names the configuration.
     """
     if not path.is_file():
         return False
     try:
         with zipfile.ZipFile(path) as batch:
-            labels, mark = json.loads(batch.read("labels.json")), batch.comment.decode()
+            labels, job_hash = json.loads(batch.read("labels.json")), batch.comment.decode()
             whole = batch.testzip() is None and all(label.keys() >= LABELS for label in labels)
         whole = whole and len(labels) == sum(n for _, n in job["episodes"])
     except UNREADABLE:
         whole = False
-    whole = whole and (mark == job["mark"] or (claimed and not mark))
+    whole = whole and (job_hash == job["mark"] or (claimed and not job_hash))
     if not whole:
         set_aside(path)
     return whole
@@ -315,21 +316,21 @@ def _name_scenes(config: RenderConfig) -> int | str:
 
     Of another scene than the plain one, with its name and version.
     """
-    sheet, around = load_object(config), "" if config.scene == "plain" else f"-{config.scene}{WORKSPACES}"
-    if sheet is None:
+    planar, around = load_object(config), "" if config.scene == "plain" else f"-{config.scene}{WORKSPACES}"
+    if planar is None:
         return f"{SCENES[config.object]}{around}" if around else SCENES[config.object]
-    return f"{SCENES['cloth']}{around}-{hashlib.sha256(json.dumps(sheet.to_dict()).encode()).hexdigest()[:8]}"
+    return f"{SCENES['cloth']}{around}-{hashlib.sha256(json.dumps(planar.to_dict()).encode()).hexdigest()[:8]}"
 
 
 def _describe_symmetry(config: RenderConfig) -> dict:
     """Image size, groups and mirror of the object, as dataset.json holds them."""
-    sheet = load_object(config)
-    if sheet is None:
+    planar = load_object(config)
+    if planar is None:
         groups = {name: load_group(config.object, name).permutations for name in GROUPS[config.object]}
         default, mirror, size = DEFAULT_GROUP[config.object], load_mirror(config.object), config.size
     else:
-        groups = {"identity": np.arange(len(sheet.rest))[None], OWN_GROUP: sheet.group.permutations}
-        default, mirror, size = OWN_GROUP, sheet.mirror, sheet.size
+        groups = {"identity": np.arange(len(planar.rest))[None], OWN_GROUP: planar.group.permutations}
+        default, mirror, size = OWN_GROUP, planar.mirror, planar.size
     symmetry = {name: permutations.tolist() for name, permutations in groups.items()}
     mirror = None if mirror is None else mirror.tolist()
     return {"size": list(size), "default_group": default, "symmetry": symmetry, "mirror": mirror}

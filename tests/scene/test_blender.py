@@ -21,7 +21,7 @@ from mmgsd.config import RenderConfig  # noqa: E402
 from mmgsd.paths import find_root  # noqa: E402
 from mmgsd.scene import SceneError, blender, episode, randomize  # noqa: E402
 from mmgsd.scene.objects import cloth  # noqa: E402
-from mmgsd.scene.objects.planar_object import load_sheet  # noqa: E402
+from mmgsd.scene.objects.planar_object import load_planar_object  # noqa: E402
 from mmgsd.scene.textures import procedural  # noqa: E402
 
 SIZE = (485, 485)
@@ -33,7 +33,7 @@ def folded():
     rng = np.random.default_rng(1)
     scene = blender.reset_scene()
     vertices, _ = cloth.deform(rng, "corner")
-    deformed = cloth.hand_over(vertices, {})
+    deformed = cloth.add_cloth(vertices, {})
     floor = blender.add_floor("floor", episode.FLOOR)
     blender.setup_cycles(scene, SIZE, 16)
     camera, _ = randomize.draw_camera(rng, deformed.points, SIZE, 180.0)
@@ -135,7 +135,7 @@ def test_a_folder_that_became_full_is_named(temporary, monkeypatch):
 def test_flat_cloth_is_all_visible_and_its_corners_are_the_masks_corners():
     rng = np.random.default_rng(0)
     scene = blender.reset_scene()
-    deformed = cloth.hand_over(cloth.flat_vertices(), {})
+    deformed = cloth.add_cloth(cloth.flat_vertices(), {})
     blender.setup_cycles(scene, SIZE, 4)
     camera, _ = randomize.draw_camera(rng, deformed.points, SIZE, 180.0)
     blender.place_camera(scene, camera)
@@ -238,10 +238,10 @@ def test_a_failed_job_says_why_and_leaves_nothing(tmp_path):
 
 @pytest.mark.parametrize("name", ["towel", "tshirt"])
 def test_a_sheets_points_are_its_vertices(name):
-    sheet = load_sheet(find_root() / "data" / "objects" / f"{name}.json")
+    planar = load_planar_object(find_root() / "data" / "objects" / f"{name}.json")
     blender.reset_scene()
-    vertices, _ = cloth.deform(np.random.default_rng(4), "flat", sheet)
-    mesh = cloth._add_rendered(vertices, sheet)
+    vertices, _ = cloth.deform(np.random.default_rng(4), "flat", planar)
+    mesh = cloth._add_rendered(vertices, planar)
     points = blender.read_vertices(mesh.data)[: len(vertices)]
     assert len(mesh.data.vertices) > 3 * len(vertices)
     inner = np.linalg.norm(points - vertices - [0, 0, np.mean(points[:, 2] - vertices[:, 2])], axis=1)
@@ -250,22 +250,22 @@ def test_a_sheets_points_are_its_vertices(name):
 
 
 def test_a_tshirt_lies_on_either_face():
-    sheet = load_sheet(find_root() / "data" / "objects" / "tshirt.json")
+    planar = load_planar_object(find_root() / "data" / "objects" / "tshirt.json")
     fronts = set()
     for seed in range(6):
         blender.reset_scene()
-        vertices, _ = cloth.deform(np.random.default_rng(seed), "flat", sheet)
-        a, b, c = vertices[sheet.faces[0]]
+        vertices, _ = cloth.deform(np.random.default_rng(seed), "flat", planar)
+        a, b, c = vertices[planar.faces[0]]
         fronts.add(bool(np.cross(b - a, c - a)[2] > 0))
     assert fronts == {True, False}
 
 
 def test_views_of_a_tshirt_are_labelled():
-    sheet = load_sheet(find_root() / "data" / "objects" / "tshirt.json")
+    planar = load_planar_object(find_root() / "data" / "objects" / "tshirt.json")
     config = RenderConfig(object="tshirt", train_images=1, test_images=1, views=1)
-    (view,) = episode.render_episode(config, "train", 0, 1, sheet)
-    assert view.image.shape == (*sheet.size[::-1], 3)
-    assert view.xy.shape == (len(sheet.rest), 2)
+    (view,) = episode.render_episode(config, "train", 0, 1, planar)
+    assert view.image.shape == (*planar.size[::-1], 3)
+    assert view.xy.shape == (len(planar.rest), 2)
     x, y = np.rint(view.xy[view.visible]).astype(int).T
     assert np.mean(distance_transform_edt(~view.mask)[y, x] <= 1.5) > 0.98
 

@@ -16,7 +16,7 @@ from mmgsd.config import RenderConfig
 from mmgsd.scene import SceneError
 from mmgsd.scene.blender import DeformedObject, add_attribute, add_floor, add_mesh, add_object, read_vertices
 from mmgsd.scene.objects.meshes import SPACING
-from mmgsd.scene.objects.planar_object import Sheet
+from mmgsd.scene.objects.planar_object import PlanarObject
 from mmgsd.scene.sampling import choose
 from mmgsd.symmetry import grid_group
 
@@ -53,52 +53,61 @@ def build_cloth(rng: np.random.Generator, config: RenderConfig) -> DeformedObjec
     The 625 points are (25, 25) row-major vertices of the rendered surface itself; 1 m a side.
     """
     workspace = config.scene == "workspace"
-    sheet, states = draw_rectangle(rng) if workspace else square_sheet(), WORKSPACE_STATES if workspace else STATES
+    planar, states = (
+        draw_rectangle(rng) if workspace else square_cloth(),
+        WORKSPACE_STATES if workspace else STATES,
+    )
     state = choose(rng, states)
-    vertices, frames = deform(rng, state, sheet)
-    return hand_over(vertices, {"state": state, "physics_frames": frames}, sheet)
+    vertices, frames = deform(rng, state, planar)
+    return add_cloth(vertices, {"state": state, "physics_frames": frames}, planar)
 
 
-def build_sheet(rng: np.random.Generator, sheet: Sheet) -> DeformedObject:
+def build_planar_object(rng: np.random.Generator, planar: PlanarObject) -> DeformedObject:
     """The same with a sheet of another shape, each of whose vertices is a material point."""
     state = choose(rng, STATES)
-    vertices, frames = deform(rng, state, sheet)
-    mesh = _add_rendered(vertices, sheet)
+    vertices, frames = deform(rng, state, planar)
+    mesh = _add_rendered(vertices, planar)
     points = read_vertices(mesh.data)[: len(vertices)]  # subdivision appends the new ones
     return DeformedObject(mesh, points, VISIBILITY_RADIUS, {"state": state, "physics_frames": frames})
 
 
-def hand_over(vertices: np.ndarray, info: dict[str, str | float | int], sheet: Sheet | None = None) -> DeformedObject:
+def add_cloth(
+    vertices: np.ndarray, info: dict[str, str | float | int], planar: PlanarObject | None = None
+) -> DeformedObject:
     """Add simulated vertices (1369, 3) m of the square or a rectangle to the scene as a smooth cloth on the floor."""
-    mesh = _add_rendered(vertices, sheet or square_sheet())
+    mesh = _add_rendered(vertices, planar or square_cloth())
     grid = read_vertices(mesh.data)[_order_row_major(mesh.data)]  # (73, 73, 3)
     return DeformedObject(mesh, grid[::3, ::3].reshape(-1, 3), VISIBILITY_RADIUS, info)
 
 
-def deform(rng: np.random.Generator, state: str, sheet: Sheet | None = None) -> tuple[np.ndarray, int]:
+def deform(rng: np.random.Generator, state: str, planar: PlanarObject | None = None) -> tuple[np.ndarray, int]:
     """Simulate one state of ``MOVES`` of a sheet (None: the square cloth): vertices (V, 3) m, and physics frames.
 
     ValueError for another state; SceneError, which counts why, where the sheet never comes to lie in it.
     """
     if state not in MOVES:
         raise ValueError(f"state must be one of {', '.join(MOVES)}, got {state!r}")
-    sheet, frames, faults = sheet or square_sheet(), 0, Counter()
+    planar, frames, faults = planar or square_cloth(), 0, Counter()
     for _ in range(STARTS):
-        vertices = _rippled(rng, sheet, 0.001 if state == "flat" else 0.008)
+        vertices = _rippled(rng, planar, 0.001 if state == "flat" else 0.008)
         for move in MOVES[state]:
-            vertices, count = _perform(rng, sheet, vertices, move, faults)
+            vertices, count = _perform(rng, planar, vertices, move, faults)
             frames += count
             if vertices is None:
                 break
         else:
             return vertices, frames
     reasons = ", ".join(f"{fault} {count} times" for fault, count in faults.most_common())
-    raise SceneError(f"{sheet.name} did not come to lie in the state {state!r} in {STARTS} starts with {ATTEMPTS} "
+    raise SceneError(f"{planar.name} did not come to lie in the state {state!r} in {STARTS} starts with {ATTEMPTS} "
                      f"attempts at a move each: it ended {reasons}")  # fmt: skip
 
 
 def _perform(
-    rng: np.random.Generator, sheet: Sheet, start: np.ndarray, move: tuple[Plan, ...], faults: Counter[str]
+    rng: np.random.Generator,
+    planar: PlanarObject,
+    start: np.ndarray,
+    move: tuple[Plan, ...],
+    faults: Counter[str],
 ) -> tuple[np.ndarray | None, int]:
     """The vertices after a move, None where it failed too often, and the frames of physics that all attempts took.
 
@@ -109,32 +118,32 @@ def _perform(
         vertices = start.copy()
         for plan in move:
             grasps, count = plan(rng, vertices)
-            vertices = simulate(sheet, vertices, grasps, count)
+            vertices = simulate(planar, vertices, grasps, count)
             frames += count
-        if not (fault := _find_fault(sheet, vertices)):
+        if not (fault := _find_fault(planar, vertices)):
             return vertices, frames
         faults[fault] += 1
     return None, frames
 
 
-def _find_fault(sheet: Sheet, vertices: np.ndarray) -> str:
+def _find_fault(planar: PlanarObject, vertices: np.ndarray) -> str:
     """How a cloth lies that is no good; empty where it lies hardly stretched and hardly cutting through itself."""
     if not np.isfinite(vertices).all():
         return "nowhere"
-    if measure_stretch(sheet, vertices) > MAX_STRETCH:
+    if measure_stretch(planar, vertices) > MAX_STRETCH:
         return f"stretched to more than {MAX_STRETCH:g} of its length"
     if np.ptp(vertices[:, 2]) >= MAX_HEIGHT:
         return f"{MAX_HEIGHT:g} m high or higher"
-    if count_crossings(vertices, sheet.faces) > MAX_CROSSINGS:
+    if count_crossings(vertices, planar.faces) > MAX_CROSSINGS:
         return f"cutting through itself at more than {MAX_CROSSINGS} places"
     return ""
 
 
-def measure_stretch(sheet: Sheet, vertices: np.ndarray) -> float:
+def measure_stretch(planar: PlanarObject, vertices: np.ndarray) -> float:
     """How much longer than at rest the edges of a cloth (V, 3) m are: the 99th percentile of their shares."""
-    sides = np.sort(np.stack([sheet.faces, np.roll(sheet.faces, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
+    sides = np.sort(np.stack([planar.faces, np.roll(planar.faces, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
     a, b = np.unique(sides, axis=0).T
-    now, at_rest = (np.linalg.norm(points[a] - points[b], axis=-1) for points in (vertices, sheet.rest))
+    now, at_rest = (np.linalg.norm(points[a] - points[b], axis=-1) for points in (vertices, planar.rest))
     return float(np.quantile(now / at_rest, 0.99))
 
 
@@ -154,25 +163,25 @@ def flat_vertices() -> np.ndarray:
 
 
 @functools.cache
-def square_sheet() -> Sheet:
+def square_cloth() -> PlanarObject:
     """The simulated square cloth."""
-    return Sheet("cloth", flat_vertices(), grid_faces(SIDE), grid_group("c4", side=SIDE))
+    return PlanarObject("cloth", flat_vertices(), grid_faces(SIDE), grid_group("c4", side=SIDE))
 
 
-def draw_rectangle(rng: np.random.Generator) -> Sheet:
+def draw_rectangle(rng: np.random.Generator) -> PlanarObject:
     """The square cloth, or one that is a little or up to 1.5 times longer than wide.
 
     Its points are those of the square, and its corners are as alike as a square's.
     """
-    square = square_sheet()
+    square = square_cloth()
     width = rng.choice([1.0, rng.uniform(0.93, 1.0), rng.uniform(1 / 1.5, 0.93)], p=[0.5, 0.15, 0.35])
     return dataclasses.replace(square, rest=square.rest * (width, 1.0, 1.0))
 
 
-def _rippled(rng: np.random.Generator, sheet: Sheet, height: float) -> np.ndarray:
+def _rippled(rng: np.random.Generator, planar: PlanarObject, height: float) -> np.ndarray:
     """The rest shape with long random waves of about ``height`` m: gives physics something to buckle along."""
-    vertices = sheet.rest.copy()
-    if sheet.either_face and rng.random() < 0.5:
+    vertices = planar.rest.copy()
+    if planar.either_face and rng.random() < 0.5:
         vertices *= (1, -1, -1)
     for _ in range(6):
         wave = rng.normal(size=2) * 9.0  # rad/m
@@ -302,7 +311,7 @@ MOVES: dict[str, tuple[tuple[Plan, ...], ...]] = {
 
 
 def simulate(
-    sheet: Sheet, vertices: np.ndarray, grasps: list[Grasp], frames: int, *, friction: float = FRICTION
+    planar: PlanarObject, vertices: np.ndarray, grasps: list[Grasp], frames: int, *, friction: float = FRICTION
 ) -> np.ndarray:
     """Run ``frames`` frames of cloth physics from ``vertices`` (V, 3) m at rest; the cloth remembers its flat shape.
 
@@ -312,7 +321,7 @@ def simulate(
     scene = bpy.context.scene
     scene.frame_start, scene.frame_end = 1, frames
     scene.frame_set(1)
-    cloth = add_mesh("cloth physics", sheet.rest, sheet.faces)
+    cloth = add_mesh("cloth physics", planar.rest, planar.faces)
     floor = _add_physics_floor(friction)
     _set_start(cloth, vertices)
     hooks = [_add_hook(cloth, grasp) for grasp in grasps]
@@ -378,13 +387,13 @@ def grid_faces(side: int) -> np.ndarray:
     return np.stack(quads, axis=-1).reshape(-1, 4)
 
 
-def _add_rendered(vertices: np.ndarray, sheet: Sheet) -> bpy.types.Object:
+def _add_rendered(vertices: np.ndarray, planar: PlanarObject) -> bpy.types.Object:
     """A smooth static mesh lying on z = 0: of the square cloth's, 73 × 73 vertices."""
-    coarse = add_mesh("cloth coarse", vertices, sheet.faces)
-    if sheet.name == "cloth":  # textures in its own coordinates; they have a square's symmetry
+    coarse = add_mesh("cloth coarse", vertices, planar.faces)
+    if planar.name == "cloth":  # textures in its own coordinates; they have a square's symmetry
         add_attribute(coarse.data, "rest", flat_vertices() / EXTENT)
-    low, size = sheet.rest.min(axis=0), np.ptp(sheet.rest, axis=0)
-    add_attribute(coarse.data, "face", (sheet.rest - low) / np.maximum(size, 1e-9))  # for images: 0 to 1 over it
+    low, size = planar.rest.min(axis=0), np.ptp(planar.rest, axis=0)
+    add_attribute(coarse.data, "face", (planar.rest - low) / np.maximum(size, 1e-9))  # for images: 0 to 1 over it
     subdivision = coarse.modifiers.new("subdivision", "SUBSURF")
     subdivision.levels = 1
     mesh = bpy.data.meshes.new_from_object(coarse.evaluated_get(bpy.context.evaluated_depsgraph_get()))

@@ -44,18 +44,18 @@ def read_outline(outline: Any) -> np.ndarray:
     if not extent > 0:
         raise ValueError("outline must enclose an area, got one point again and again")
     scaled = (corners - corners[0]) / extent
-    kept = _drop_straight(scaled, _drop_repeated(scaled))
-    if len(kept) < 3:
+    selected = _drop_straight(scaled, _drop_repeated(scaled))
+    if len(selected) < 3:
         raise ValueError("outline must enclose an area, got corners on one line")
-    _refuse_crossing(scaled[kept], corners[kept])
-    x, y = scaled[kept].T
+    _refuse_crossing(scaled[selected], corners[selected])
+    x, y = scaled[selected].T
     area = 0.5 * np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)
     if abs(area) < MIN_AREA:
         raise ValueError(f"outline must enclose an area of {MIN_AREA:.0%} of the square around it or more, "
                          f"got {abs(area):.1%}")  # fmt: skip
-    if (length := np.linalg.norm(scaled[kept] - np.roll(scaled[kept], -1, axis=0), axis=1).sum()) > MAX_LENGTH:
+    if (length := np.linalg.norm(scaled[selected] - np.roll(scaled[selected], -1, axis=0), axis=1).sum()) > MAX_LENGTH:
         raise ValueError(f"outline must be at most {MAX_LENGTH:g} times as long as its longest side, got {length:.0f}")
-    corners = corners[kept][:: int(np.sign(area))] / extent
+    corners = corners[selected][:: int(np.sign(area))] / extent
     return np.column_stack([corners, np.zeros(len(corners))])
 
 
@@ -80,26 +80,26 @@ def is_number(value: Any) -> bool:
 
 def _drop_repeated(points: np.ndarray) -> list[int]:
     """Indices of the points (N, 2) of a ring that do not repeat the one before, nor the last ones the first."""
-    kept: list[int] = []
+    selected: list[int] = []
     for i, point in enumerate(points):
-        if not kept or np.hypot(*(point - points[kept[-1]])) >= MERGED:
-            kept.append(i)
-    while len(kept) > 1 and np.hypot(*(points[kept[-1]] - points[kept[0]])) < MERGED:
-        kept.pop()
-    return kept
+        if not selected or np.hypot(*(point - points[selected[-1]])) >= MERGED:
+            selected.append(i)
+    while len(selected) > 1 and np.hypot(*(points[selected[-1]] - points[selected[0]])) < MERGED:
+        selected.pop()
+    return selected
 
 
 def _drop_straight(points: np.ndarray, ring: list[int]) -> list[int]:
     """Those indices of a ring of points (N, 2) at which it turns; a point at which it turns back is kept."""
     place = (points[:, 0] + 1j * points[:, 1]).tolist()
-    kept: list[int] = []
+    selected: list[int] = []
     for position, i in enumerate(ring):
-        before, after = place[kept[-1] if kept else ring[-1]], place[ring[(position + 1) % len(ring)]]
+        before, after = place[selected[-1] if selected else ring[-1]], place[ring[(position + 1) % len(ring)]]
         chord, step = after - before, place[i] - before
         aside = abs((chord.conjugate() * step).imag) > STRAIGHT * abs(chord)
         if aside or (step.conjugate() * (after - place[i])).real <= 0:
-            kept.append(i)
-    return kept
+            selected.append(i)
+    return selected
 
 
 def _refuse_crossing(points: np.ndarray, corners: np.ndarray) -> None:
@@ -243,11 +243,11 @@ def _read_vertex(words: list[bytes]) -> list[float]:
 def _read_face(words: list[bytes], count: int) -> list[list[int]]:
     """The triangles of a polygon; a negative index counts back from the last of ``count`` vertices."""
     try:
-        given = [int(word.split(b"/")[0]) for word in words]
+        numbers = [int(word.split(b"/")[0]) for word in words]
     except ValueError:
-        given = []
-    corners = [c - 1 if c > 0 else count + c for c in given]
-    if len(given) < 3 or 0 in given or min(corners) < 0:
+        numbers = []
+    corners = [c - 1 if c > 0 else count + c for c in numbers]
+    if len(numbers) < 3 or 0 in numbers or min(corners) < 0:
         raise ValueError("must hold the numbers of three or more vertices")
     if len(set(corners)) != len(corners):
         raise ValueError("must hold different vertices")

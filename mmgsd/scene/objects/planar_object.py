@@ -1,4 +1,4 @@
-"""Sheets of your own: a flat shape by its outline, or a mesh file, and its symmetry, in one small JSON file.
+"""Planar objects of your own: a flat shape by its outline, or a mesh file, and its symmetry, in one small JSON file.
 
     {"outline": [[0, 0], [90, 0], [90, 50], [0, 50]], "symmetry": "turns"}
 
@@ -40,7 +40,7 @@ KEYS = ("outline", "mesh", "up", "symmetry", "image_size")
 
 
 @dataclass(frozen=True, eq=False)
-class Sheet:
+class PlanarObject:
     """A sheet at rest in the plane z = 0, or a mesh about it, centred; every vertex is a material point."""
 
     name: str
@@ -58,16 +58,16 @@ class Sheet:
         return {**vars(self), **arrays, "group": self.group.to_dict(), "size": list(self.size)}
 
     @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> Sheet:
-        """Rebuild a sheet from :meth:`to_dict`'s values."""
+    def from_dict(cls, values: dict[str, Any]) -> PlanarObject:
+        """Rebuild one from :meth:`to_dict`'s values."""
         mirror = None if values["mirror"] is None else np.array(values["mirror"])
         arrays = {"rest": np.array(values["rest"]), "faces": np.array(values["faces"]), "mirror": mirror}
         group, size = SymmetryGroup.from_dict(values["group"]), tuple(values["size"])
         return cls(**{**values, **arrays, "group": group, "size": size})
 
 
-def load_sheet(path: Path | str) -> Sheet:
-    """Read a sheet's JSON file (see the module) and build its mesh and group.
+def load_planar_object(path: Path | str) -> PlanarObject:
+    """Read a planar object's JSON file (see the module) and build its mesh and group.
 
     FileNotFoundError where it is missing, with the nearest name that there is; ValueError, which names the file and
     the key, for what it says, and for a mesh that is missing.
@@ -86,7 +86,7 @@ def load_sheet(path: Path | str) -> Sheet:
         raise ValueError(f"{path}: {error}") from error
 
 
-def _build(path: Path, values: Any) -> Sheet:
+def _build(path: Path, values: Any) -> PlanarObject:
     _check_keys(values)
     size = tuple(values.get("image_size", (485, 485)))
     permutations, symmetry = _read_permutations(values["symmetry"]) if "mesh" in values else None, values["symmetry"]
@@ -104,7 +104,7 @@ def _build(path: Path, values: Any) -> Sheet:
         raise ValueError(f"permutations must be rows of {len(rest)}, one entry a vertex; got {group.n_points}")
     turned_over = [t for t in transforms if t[2, 2] < 0]
     mirror = _permute(rest, turned_over[0]) if turned_over else _find_mirror(rest, border)
-    return Sheet(path.stem, rest, faces, group, bool(turned_over), mirror, size)
+    return PlanarObject(path.stem, rest, faces, group, bool(turned_over), mirror, size)
 
 
 def _check_keys(values: Any) -> None:

@@ -1,6 +1,6 @@
-"""What lies about in a workspace, beside the object or on it: boxes, mugs, books, cords, textiles, grippers, hands.
+"""Distractors beside the object, occluders on it: boxes, mugs, books, cords, textiles, grippers, hands.
 
-A maker gives the parts of a thing of about a hand's size (m) that stands on z = 0 at the origin.
+A maker gives the parts of one of about a hand's size (m) that stands on z = 0 at the origin.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from mmgsd.scene.workspace.primitives import (
     make_box,
     make_capsule,
     make_lathe,
-    make_sheet,
+    make_textile,
     make_tube,
     merge,
     move,
@@ -30,8 +30,8 @@ from mmgsd.scene.workspace.primitives import (
 from mmgsd.scene.workspace.surfaces import Site, add_solid
 
 TRIES = 12  # to find a place
-OVER_COUNTS = (0.6, 0.3, 0.1)  # probabilities of 0, 1 and 2 things on the object
-MOST_HIDDEN = 0.5  # share of the points seen that things may cover
+OCCLUDER_COUNTS = (0.6, 0.3, 0.1)  # probabilities of 0, 1 and 2 things on the object
+MAX_OCCLUDED = 0.5  # share of the points seen that may be covered
 SKINS = ((236, 188, 160), (198, 134, 100), (141, 85, 54), (82, 50, 34), (60, 120, 200), (20, 20, 22))  # and gloves
 
 Part = tuple[Solid, RGB, bool]  # a solid, its colour, and whether it may be printed upon
@@ -92,7 +92,7 @@ def _make_textile(rng: np.random.Generator) -> list[Part]:
     """Another cloth, rippled."""
     width, length = rng.uniform(0.3, 1.2, size=2)
     ripple = 0.002 + rng.uniform(0.004, 0.03) * rng.random((9, 9))
-    return [(make_sheet(width, length, ripple), draw_rgb(rng), True)]
+    return [(make_textile(width, length, ripple), draw_rgb(rng), True)]
 
 
 def _make_weight(rng: np.random.Generator) -> list[Part]:
@@ -146,41 +146,43 @@ def _scale(parts: list[Part], factor: float) -> list[Part]:
     return [(Solid(solid.vertices * factor, solid.faces, solid.smooth), *rest) for solid, *rest in parts]
 
 
-BESIDE: dict[str, Maker] = {
+DISTRACTORS: dict[str, Maker] = {
     "box": _make_box, "disc": _make_disc, "mug": _make_mug, "book": _make_book, "pen": _make_pen,
     "weight": _make_weight, "textile": _make_textile, "cord": _make_cord,
 }  # fmt: skip
-OVER: dict[str, Maker] = {"gripper": _make_gripper, "tool": _make_tool, "hand": _make_hand}
-UPON: dict[str, Maker] = {name: BESIDE[name] for name in ("pen", "weight", "disc", "box", "cord")}
+OCCLUDERS: dict[str, Maker] = {"gripper": _make_gripper, "tool": _make_tool, "hand": _make_hand}
+ON_OBJECT: dict[str, Maker] = {name: DISTRACTORS[name] for name in ("pen", "weight", "disc", "box", "cord")}
 
 
 # Places. --------------------------------------------------------------------------------------------------------------
 
 
-def add_things(rng: np.random.Generator, site: Site, camera: Camera, visible: np.ndarray, *, beside: bool,
-               walls: list[Solid], over: bool = True) -> tuple[np.ndarray, list[str]]:  # fmt: skip
-    """Put things around and on the object: which points (P,) of those ``visible`` they leave so, and their names.
+def add_distractors(
+    rng: np.random.Generator, site: Site, camera: Camera, visible: np.ndarray, *, beside: bool, walls: list[Solid],
+    over: bool = True,
+) -> tuple[np.ndarray, list[str]]:  # fmt: skip
+    """Put distractors around the object and occluders on it: which points (P,) stay ``visible``, and their names.
 
     ``walls`` are solids that are there already; without ``over`` nothing lies on the object or reaches for it. What
     would hide too much, or stand before the lens, is left out.
     """
     scale, names = log_uniform(rng, 0.5, 1.6) * site.side, []
-    left = visible & ~find_covered(walls, site.points, camera)
+    remaining = visible & ~find_occluded(walls, site.points, camera)
     for name, maker, place in _choose(rng, site, beside, over):
         for _ in range(TRIES):
             parts = place(rng, site, _scale(maker(rng), scale))
             if parts is None or not _is_clear(parts, camera):
                 continue
-            still = left & ~find_covered([solid for solid, *_ in parts], site.points, camera)
-            if still.sum() >= max(8, (1 - MOST_HIDDEN) * visible.sum()) or not visible.any():
-                left = still
+            after = remaining & ~find_occluded([solid for solid, *_ in parts], site.points, camera)
+            if after.sum() >= max(8, (1 - MAX_OCCLUDED) * visible.sum()) or not visible.any():
+                remaining = after
                 names.append(name)
                 _add(rng, parts)
                 break
-    return left, names
+    return remaining, names
 
 
-def find_covered(solids: list[Solid], points: np.ndarray, camera: Camera) -> np.ndarray:
+def find_occluded(solids: list[Solid], points: np.ndarray, camera: Camera) -> np.ndarray:
     """Which points (P, 3) lie behind one of the solids, seen from the camera: (P,) bool."""
     covered, eye = np.zeros(len(points), dtype=bool), camera.pose[:3, 3]
     if not solids:
@@ -196,13 +198,13 @@ def find_covered(solids: list[Solid], points: np.ndarray, camera: Camera) -> np.
 def _choose(rng: np.random.Generator, site: Site, beside: bool, over: bool) -> Iterator[tuple[str, Maker, Place]]:
     """Names, makers and placers of what is put around and on the object; no cord beside a rope, they are too alike."""
     cords = {"cord"} if site.slender else set()
-    around = {name: maker for name, maker in BESIDE.items() if name not in cords}
-    upon = {name: maker for name, maker in UPON.items() if name not in cords}
+    around = {name: maker for name, maker in DISTRACTORS.items() if name not in cords}
+    upon = {name: maker for name, maker in ON_OBJECT.items() if name not in cords}
     for _ in range(min(6, rng.poisson(1.6)) if beside else 0):
         name = str(rng.choice(list(around)))
         yield name, around[name], _place_beside
-    for _ in range(int(rng.choice(len(OVER_COUNTS), p=OVER_COUNTS)) if over else 0):
-        kinds, place = (OVER, _place_over) if rng.random() < 0.65 else (upon, _place_upon)
+    for _ in range(int(rng.choice(len(OCCLUDER_COUNTS), p=OCCLUDER_COUNTS)) if over else 0):
+        kinds, place = (OCCLUDERS, _place_over) if rng.random() < 0.65 else (upon, _place_upon)
         name = str(rng.choice(list(kinds)))
         yield name, kinds[name], place
 
@@ -210,7 +212,7 @@ def _choose(rng: np.random.Generator, site: Site, beside: bool, over: bool) -> I
 def _place_beside(rng: np.random.Generator, site: Site, parts: list[Part]) -> list[Part] | None:
     """Standing somewhere in the picture, clear of the object; None where it is not."""
     vertices = np.concatenate([solid.vertices for solid, *_ in parts])[:, :2]
-    place, turn = site.seen[rng.integers(len(site.seen))], site.draw_turn(rng)
+    place, turn = site.ground_points[rng.integers(len(site.ground_points))], site.draw_turn(rng)
     moved = _move(parts, turn, (*place, -0.002))
     outline = np.concatenate([solid.vertices for solid, *_ in moved])[:, :2]
     gap = cKDTree(outline).query(site.points[::5, :2])[0].min()
@@ -257,4 +259,4 @@ def _is_clear(parts: list[Part], camera: Camera) -> bool:
 def _add(rng: np.random.Generator, parts: list[Part]) -> None:
     for solid, colour, printed in parts:
         picture = printed and rng.random() < 0.5
-        add_solid(solid, paint_surface(rng, colour, sheet=True)[0] if picture else paint_plain(rng, colour))
+        add_solid(solid, paint_surface(rng, colour, fitted=True)[0] if picture else paint_plain(rng, colour))

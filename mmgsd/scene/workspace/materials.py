@@ -42,16 +42,16 @@ def add_picture(shader: Shader, pixels: np.ndarray, place: object, *, repeat: bo
 # Around the object. ---------------------------------------------------------------------------------------------------
 
 
-def paint_surface(rng: np.random.Generator, colour: RGB, *, sheet: bool) -> tuple[bpy.types.Material, str]:
-    """A material of a floor, a table or, over all of it, of a ``sheet``; and the name of its texture."""
+def paint_surface(rng: np.random.Generator, colour: RGB, *, fitted: bool) -> tuple[bpy.types.Material, str]:
+    """A material of what lies around, ``fitted`` to its own extent or laid over the plane; the name of its texture."""
     shader = new_shader()
-    kind = str(rng.choice(["plain", "procedural", "picture"], p=[0.4, 0.25, 0.35] if sheet else [0.3, 0.45, 0.25]))
+    kind = str(rng.choice(["plain", "procedural", "picture"], p=[0.4, 0.25, 0.35] if fitted else [0.3, 0.45, 0.25]))
     if kind == "picture":
         name = str(rng.choice(list(printed.PICTURES), p=[0.3, 0.12, 0.1, 0.12, 0.08, 0.08, 0.2]))
         pixels = printed.PICTURES[name](rng, colour)
-        place = shader.node("TexCoord").outputs["Generated" if sheet else "Object"]
-        scale = 1.0 if sheet else log_uniform(rng, 0.25, 2.0)
-        surface = add_picture(shader, pixels, _map(rng, shader, place, scale, turned=not sheet))
+        place = shader.node("TexCoord").outputs["Generated" if fitted else "Object"]
+        scale = 1.0 if fitted else log_uniform(rng, 0.25, 2.0)
+        surface = add_picture(shader, pixels, _map(rng, shader, place, scale, turned=not fitted))
     else:
         name = "plain" if kind == "plain" else choose(rng, PROCEDURAL)
         place = _map(rng, shader, shader.node("TexCoord").outputs["Object"], 1.0, turned=True)

@@ -1,4 +1,4 @@
-"""Simple solids as vertices and faces: what the things of a workspace are put together from. Metres."""
+"""Simple solids as vertices and faces: what distractors and surfaces are put together from. Metres."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def make_walls(outline: np.ndarray, bottom: float, top: float) -> Solid:
     return merge(parts)
 
 
-def make_sheet(width: float, length: float, ripple: np.ndarray, *, cells: int = 24) -> Solid:
+def make_textile(width: float, length: float, ripple: np.ndarray, *, cells: int = 24) -> Solid:
     """A rectangle of cloth with waves of heights given at a grid (n, n) of its own, smoothly in between."""
     v, u = np.mgrid[0 : 1 : (cells + 1) * 1j, 0 : 1 : (cells + 1) * 1j]
     knots = np.linspace(0, 1, len(ripple))

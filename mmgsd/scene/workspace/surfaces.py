@@ -26,7 +26,7 @@ class Site:
     points: np.ndarray  # (P, 3) material points
     side: float  # of the cloth at rest, or what the rope spans
     turn: float  # rad, of the picture's axes about z
-    seen: np.ndarray  # (K, 2) places on the ground that the picture shows
+    ground_points: np.ndarray  # (K, 2) places on the ground that the picture shows
     colour: RGB  # mean of the object
     thickness: float  # of the object above its points
     slender: bool  # a rope: what looks like it must not lie about
@@ -67,7 +67,7 @@ def add_plate(centre: np.ndarray, size: np.ndarray, turn: float, top: float, thi
     added.location, added.rotation_euler = (*centre, top), (0, 0, turn)
 
 
-def draw_ground(rng: np.random.Generator, site: Site) -> tuple[str, list[Solid], RGB | None]:
+def add_surfaces(rng: np.random.Generator, site: Site) -> tuple[str, list[Solid], RGB | None]:
     """Add what lies under the object; its kind, solids that may hide the object, and the mask's colour if masked."""
     kind = choose(rng, KINDS)
     if kind == "masked":
@@ -76,16 +76,16 @@ def draw_ground(rng: np.random.Generator, site: Site) -> tuple[str, list[Solid],
         return kind, [], colour
     thick = float(rng.choice([0.0, 0.003, 0.02], p=[0.35, 0.35, 0.3]))
     walls = []
-    main, name = paint_surface(rng, draw_similar_rgb(rng, site.colour, 0.18), sheet=kind in ("board", "tray"))
+    main, name = paint_surface(rng, draw_similar_rgb(rng, site.colour, 0.18), fitted=kind in ("board", "tray"))
     if kind == "floor":
         _add_floor(main, -thick - 12 * STEP)
     else:
         deep = 0.75 if kind == "table" else thick + 12 * STEP
-        _add_floor(paint_surface(rng, draw_table_rgb(rng), sheet=False)[0], -deep)
+        _add_floor(paint_surface(rng, draw_table_rgb(rng), fitted=False)[0], -deep)
         outline = _add_top(rng, site, kind, thick, main)
         walls = _add_walls(rng, outline) if kind == "tray" else []
     for level in range(int(rng.choice([0, 1, 2, 3], p=[0.35, 0.3, 0.2, 0.15]))):
-        _add_sheet(rng, site, -(1 + level) * STEP)
+        _add_mat(rng, site, -(1 + level) * STEP)
     if rng.random() < 0.15:
         _add_seams(rng, site)
     return f"{kind}, {name}", walls, None
@@ -136,16 +136,16 @@ def _add_walls(rng: np.random.Generator, outline: np.ndarray) -> list[Solid]:
     return [add_solid(walls, paint_plain(rng, draw_rgb(rng)), "walls")]
 
 
-def _add_sheet(rng: np.random.Generator, site: Site, top: float) -> None:
+def _add_mat(rng: np.random.Generator, site: Site, top: float) -> None:
     """A mat, a paper or a board: as large as the object and square, or not; under it, half under it or beside it."""
     size = np.full(2, site.side * (rng.uniform(0.75, 1.25) if rng.random() < 0.5 else rng.uniform(0.15, 1.0)))
     if rng.random() < 0.5:
         size[1] *= rng.choice([0.707, rng.uniform(0.3, 1.0)])
-    place = site.seen[rng.integers(len(site.seen))]
+    place = site.ground_points[rng.integers(len(site.ground_points))]
     if rng.random() < 0.35:
         place = site.middle + rng.uniform(-0.6, 0.6, size=2) * site.side
     like = draw_similar_rgb(rng, site.colour, 0.3)
-    material = paint_surface(rng, like, sheet=True)[0] if rng.random() < 0.7 else paint_plain(rng, like)
+    material = paint_surface(rng, like, fitted=True)[0] if rng.random() < 0.7 else paint_plain(rng, like)
     add_plate(place, size, site.draw_turn(rng), top, 3 * STEP, material)
 
 
@@ -153,6 +153,9 @@ def _add_seams(rng: np.random.Generator, site: Site) -> None:
     """Gaps between boards or tape on the floor: long bars across the picture."""
     material, turn = paint_plain(rng, draw_rgb(rng)), site.draw_turn(rng)
     width = float(rng.choice([0.004, 0.012, 0.05]))
-    bars = [move(make_box((12, width, STEP / 2)), turn + rng.integers(2) * np.pi / 2, (*place, -STEP / 2))
-            for place in site.seen[rng.integers(len(site.seen), size=rng.integers(1, 4))]]  # fmt: skip
+    places = site.ground_points[rng.integers(len(site.ground_points), size=rng.integers(1, 4))]
+    bars = [
+        move(make_box((12, width, STEP / 2)), turn + rng.integers(2) * np.pi / 2, (*place, -STEP / 2))
+        for place in places
+    ]
     add_solid(merge(bars), material, "seams")

@@ -21,9 +21,9 @@ from mmgsd.scene.blender import Camera, DeformedObject, View
 from mmgsd.scene.geometry import compute_direction, find_middle
 from mmgsd.scene.objects.cloth import EXTENT
 from mmgsd.scene.sampling import log_uniform
-from mmgsd.scene.workspace.distractors import add_things
+from mmgsd.scene.workspace.distractors import add_distractors
 from mmgsd.scene.workspace.materials import paint_object, remove_view
-from mmgsd.scene.workspace.surfaces import Site, draw_ground
+from mmgsd.scene.workspace.surfaces import Site, add_surfaces
 
 ABSENT = 0.035  # share of the views without the object, of those that nobody has masked
 MAX_TILT_DEG = 50.0
@@ -42,10 +42,10 @@ def render_view(
     blender.place_camera(scene, camera)
     colour, texture = paint_object(rng, deformed.mesh)
     site = _describe_site(rng, config, deformed, camera, turn, colour)
-    ground, walls, masked = draw_ground(rng, site)
+    ground, walls, masked = add_surfaces(rng, site)
     present = rng.random() >= ABSENT or masked is not None
     visible = blender.find_visible(deformed, bvh, camera)
-    visible, things = add_things(rng, site, camera, visible, beside=masked is None, walls=walls)
+    visible, distractors = add_distractors(rng, site, camera, visible, beside=masked is None, walls=walls)
     light = draw_light(rng, scene, site.side, np.append(site.middle, 0.0))
     deformed.mesh.hide_render = not present
     image, mask = blender.render_image(scene, seed=int(rng.integers(2**31)))
@@ -60,7 +60,7 @@ def render_view(
         visible=visible & present,
         intrinsics=camera.intrinsics,
         camera_pose=camera.pose,
-        info={**deformed.info, **labels, "things": ", ".join(things), "present": present},
+        info={**deformed.info, **labels, "things": ", ".join(distractors), "present": present},
     )
 
 
@@ -72,10 +72,10 @@ def _describe_site(
     slender = deformed.is_own_hit is not None
     thickness = deformed.visibility_radius / 2 if slender else 0.0
     side = EXTENT if config.object == "cloth" else span
-    return Site(deformed.points, side, turn, find_seen(rng, camera), colour, thickness, slender)
+    return Site(deformed.points, side, turn, sample_ground_points(rng, camera), colour, thickness, slender)
 
 
-def find_seen(rng: np.random.Generator, camera: Camera) -> np.ndarray:
+def sample_ground_points(rng: np.random.Generator, camera: Camera) -> np.ndarray:
     """Places (K, 2) m on z = 0 that the picture shows, evenly spread over the picture and a little beyond."""
     xy = (rng.uniform(-0.08, 1.08, size=(60, 2))) * camera.size
     rays = np.column_stack([xy, np.ones(len(xy))]) @ np.linalg.inv(camera.intrinsics).T @ camera.pose[:3, :3].T

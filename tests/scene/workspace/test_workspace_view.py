@@ -19,7 +19,7 @@ from mmgsd.scene import blender, environment_maps  # noqa: E402
 from mmgsd.scene.blender import DeformedObject  # noqa: E402
 from mmgsd.scene.episode import render_episode  # noqa: E402
 from mmgsd.scene.objects import cloth  # noqa: E402
-from mmgsd.scene.objects.planar_object import load_sheet  # noqa: E402
+from mmgsd.scene.objects.planar_object import load_planar_object  # noqa: E402
 from mmgsd.scene.textures import printed  # noqa: E402
 from mmgsd.scene.workspace import distractors, materials, primitives, surfaces, view  # noqa: E402
 
@@ -29,14 +29,14 @@ FLAT = DeformedObject(None, cloth.flat_vertices()[::7], cloth.VISIBILITY_RADIUS,
 
 def render_views(name: str, views: int, episode: int = 0) -> list[blender.View]:
     own = name not in ("cloth", "rope")
-    sheet = load_sheet(find_root() / "data" / "objects" / f"{name}.json") if own else None
+    planar = load_planar_object(find_root() / "data" / "objects" / f"{name}.json") if own else None
     config = RenderConfig(object=name, train_images=1, test_images=1, views=1, scene="workspace")
-    return render_episode(config, "train", episode, views, sheet)
+    return render_episode(config, "train", episode, views, planar)
 
 
 @pytest.mark.parametrize("name", ["cloth", "rope", "tshirt"])
 def test_visible_points_lie_in_the_mask_whatever_covers_the_object(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(distractors, "OVER_COUNTS", (0.0, 0.0, 1.0))
+    monkeypatch.setattr(distractors, "OCCLUDER_COUNTS", (0.0, 0.0, 1.0))
     for shot in render_views(name, 3):
         assert shot.info["present"] == shot.mask.any() == shot.visible.any()
         x, y = np.rint(shot.xy[shot.visible]).astype(int).T
@@ -89,23 +89,23 @@ def test_the_object_is_in_the_picture_however_the_camera_tilts(limit: float) -> 
 def test_points_behind_a_thing_are_covered_and_the_others_are_not() -> None:
     camera = view.frame_points(np.random.default_rng(0), FLAT.points, SIZE, 0.0, 0.0, 0.8, 3.0)
     box = primitives.make_box((0.3, 0.3, 0.02), (0.2, 0.2, 0.1))
-    covered = distractors.find_covered([box], FLAT.points, camera)
+    covered = distractors.find_occluded([box], FLAT.points, camera)
     apart = np.abs(FLAT.points[:, :2] - 0.2).max(axis=1)
     assert covered[apart < 0.1].all() and not covered[apart > 0.25].any()
-    assert not distractors.find_covered([], FLAT.points, camera).any()
+    assert not distractors.find_occluded([], FLAT.points, camera).any()
 
 
 def test_things_leave_at_least_half_of_the_object_to_be_seen(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(distractors, "OVER_COUNTS", (0.0, 0.0, 1.0))
+    monkeypatch.setattr(distractors, "OCCLUDER_COUNTS", (0.0, 0.0, 1.0))
     camera = view.frame_points(np.random.default_rng(0), FLAT.points, SIZE, 0.0, 20.0, 0.8, 3.0)
     seen = np.ones(len(FLAT.points), dtype=bool)
     site = surfaces.Site(FLAT.points, 1.0, 0.0, np.random.default_rng(1).uniform(-2, 2, (60, 2)), (9, 9, 9), 0.0, False)
     hidden = []
     for seed in range(12):
         blender.reset_scene()
-        left, _ = distractors.add_things(np.random.default_rng(seed), site, camera, seen, beside=True, walls=[])
+        left, _ = distractors.add_distractors(np.random.default_rng(seed), site, camera, seen, beside=True, walls=[])
         hidden.append(1 - left.mean())
-    assert max(hidden) <= distractors.MOST_HIDDEN and np.mean(np.array(hidden) > 0.01) > 0.5
+    assert max(hidden) <= distractors.MAX_OCCLUDED and np.mean(np.array(hidden) > 0.01) > 0.5
 
 
 def test_a_rope_has_no_cords_beside_it() -> None:
@@ -124,8 +124,8 @@ def test_things_cast_shadows() -> None:
     box = primitives.make_box((0.2, 0.2, 0.3), (0, 0, 0.15))
     surfaces.add_solid(box, materials.paint_plain(np.random.default_rng(0), (250, 250, 250)))
     blender.place_camera(scene, view.frame_points(np.random.default_rng(0), FLAT.points, SIZE, 0.0, 0.0, 1.0, 3.0))
-    view.randomize.set_world(scene, (1.0, 1.0, 1.0, 1.0), 0.1)
-    lamp = view.randomize.new_lamp(scene, "SUN")
+    view.lighting.set_world(scene, (1.0, 1.0, 1.0, 1.0), 0.1)
+    lamp = view.lighting.add_lamp(scene, "SUN", 0.1)
     lamp.data.energy, lamp.rotation_euler = 3.0, (0.0, np.radians(50), 0.0)  # from +x
     image, _ = blender.render_image(scene, seed=0)
     row = image[SIZE[1] // 2].mean(axis=1)
@@ -148,7 +148,7 @@ def test_a_map_lights_a_level_sheet_as_brightly_as_asked(path: Path, monkeypatch
     assert environment_maps.light_world(rng, scene, 0.5, np.ones(3)) == f"map {path.stem}"
     assert photograph_sheet(scene).mean() == pytest.approx(blender.encode_srgb(np.array(0.5)), rel=0.12)
     environment_maps.remove_map(scene)
-    view.randomize.set_world(scene, (1.0, 0.0, 0.0, 1.0), 1.0)
+    view.lighting.set_world(scene, (1.0, 0.0, 0.0, 1.0), 1.0)
     assert photograph_sheet(scene)[..., 1:].mean() < 40  # nothing of the map is left
 
 
@@ -187,10 +187,10 @@ def test_every_picture_is_a_picture(name: str, rng: np.random.Generator) -> None
     assert image.shape == (printed.SIDE, printed.SIDE, 3) and image.dtype == np.uint8
 
 
-@pytest.mark.parametrize("name", [*distractors.BESIDE, *distractors.OVER])
+@pytest.mark.parametrize("name", [*distractors.DISTRACTORS, *distractors.OCCLUDERS])
 def test_every_thing_stands_on_the_table_and_is_closed_to_rays(name: str, rng: np.random.Generator) -> None:
     for _ in range(5):
-        for solid, _, _ in (distractors.BESIDE | distractors.OVER)[name](rng):
+        for solid, _, _ in (distractors.DISTRACTORS | distractors.OCCLUDERS)[name](rng):
             assert np.isfinite(solid.vertices).all() and solid.faces.max() < len(solid.vertices)
             assert solid.vertices[:, 2].min() > -0.05
 
