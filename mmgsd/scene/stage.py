@@ -18,7 +18,7 @@ import sys
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +27,7 @@ from dask.distributed import Client, LocalCluster
 from dask.system import cpu_count
 
 from mmgsd.checks import read_count, read_flag
-from mmgsd.cluster import open_client, wait_for_each
+from mmgsd.cluster import open_client, run_tasks
 from mmgsd.config import DEFAULT_GROUP, OBJECTS, OWN_GROUP, RenderConfig, list_later, to_dict
 from mmgsd.dataset import load_dataset
 from mmgsd.dataset_format import FORMAT, SPLITS, encode_table, find_owner, is_member
@@ -168,10 +168,19 @@ def render_batch(job: dict) -> bytes:
     """Render one job in a child process and return its zip file; RenderError where the child fails."""
     with scratch_folder(Path(tempfile.gettempdir()), "mmgsd-batch") as folder:
         out = folder / "batch.zip"
-        code, stderr = run_child({**job, "out": str(out), "parent": os.getpid()}, folder)
-        if code or not out.is_file():
-            raise RenderError(f"rendering {job['split']} {job['episodes']} {describe_exit(code)}:\n{stderr[-2000:]}")
-        return out.read_bytes()
+        (data,) = run_job(job | {"out": str(out)}, folder, f"rendering {job['split']} {job['episodes']}", [out])
+        return data
+
+
+def run_job(job: dict, folder: Path, doing: str, outs: Sequence[Path]) -> list[bytes]:
+    """What a child writes to ``outs`` (see `run_child`); RenderError, which says what it was ``doing``, where it fails.
+
+    It ends with this process.
+    """
+    code, stderr = run_child(job | {"parent": os.getpid()}, folder)
+    if code or not all(out.is_file() for out in outs):
+        raise RenderError(f"{doing} {_describe_exit(code)}:\n{stderr[-2000:]}")
+    return [out.read_bytes() for out in outs]
 
 
 def run_child(job: dict, folder: Path) -> tuple[int, str]:
@@ -195,7 +204,7 @@ def run_child(job: dict, folder: Path) -> tuple[int, str]:
     return child.returncode, stderr
 
 
-def describe_exit(code: int) -> str:
+def _describe_exit(code: int) -> str:
     """How a child ended, from its exit code."""
     if code >= 0:
         return "failed"
@@ -251,16 +260,12 @@ def _render_missing(
 
 
 def _render_batches(client: Client, jobs: dict, partial: Path, config: RenderConfig, progress: bool) -> None:
-    futures = {client.submit(render_batch, job, pure=False, retries=2): name for name, job in jobs.items()}
     total = sum(n for job in jobs.values() for _, n in job["episodes"])
-    try:
-        with ProgressBar(total=total, desc=f"render {config.object}", unit="image", disable=not progress) as bar:
-            for future in wait_for_each(client, list(futures)):
-                name = futures.pop(future)
-                write_bytes(partial / f"{name}.zip", future.result())
-                bar.update(sum(n for _, n in jobs[name]["episodes"]))
-    finally:
-        client.cancel(list(futures))  # after an error or a Ctrl-C, none of the rest is begun
+    bar = ProgressBar(total=total, desc=f"render {config.object}", unit="image", disable=not progress)
+    with bar, run_tasks(client, render_batch, jobs, retries=2) as results:
+        for name, data in results:
+            write_bytes(partial / f"{name}.zip", data)
+            bar.update(sum(n for _, n in jobs[name]["episodes"]))
 
 
 def _is_claimed(config: RenderConfig, partial: Path) -> bool:
