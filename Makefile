@@ -14,7 +14,7 @@ PYTHON ?= $(shell for p in python3.11 python3 python; do \
 TORCH_INDEX ?=
 # CUDA=1 installs torch with CUDA instead of the CPU build.
 CUDA ?=
-# make figures, paper, data-pack, data-unpack, data-sample, weights: of which preset.
+# make figures, paper, data-sample, weights: of which preset.
 PRESET ?= paper
 # make test: in so many processes at once, by default one a core up to four; each computes in one thread.
 JOBS ?= $(shell n=$$(nproc 2>/dev/null || echo 2); echo $$(( n < 4 ? n : 4 )))
@@ -34,8 +34,8 @@ STAMP := .venv/.installed
 PYTEST := OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(PY) -m pytest --numprocesses $(JOBS) --dist loadfile --no-loadscope-reorder
 PAPERMILL := $(PY) -m papermill --kernel python3
 
-.PHONY: help .venv reproduce smoke test lint unit notebooks-test figures paper readme weights data-pack data-unpack \
-	data-sample lab lock clean clean-all force
+.PHONY: help .venv reproduce smoke test lint unit notebooks-test figures paper readme weights data-sample \
+	lab lock clean clean-all force
 
 help: ## List the targets
 	@grep -hE '^[.a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | awk -F'\t' '{ printf "  make %-15s %s\n", $$1, $$2 }'
@@ -66,15 +66,8 @@ figures: $(STAMP) ## Draw the paper's figures of PRESET (paper) again from data/
 readme: $(STAMP) ## Put the numbers of data/results into README.md, the results page and docs/claims.md
 	$(PY) -m mmgsd.report.tables data/results README.md data/results/README.md docs/claims.md
 
-data-pack: $(STAMP) ## Pack the data sets of PRESET (paper) into data/packs, to travel to another machine
-	$(PY) -m mmgsd.extras.packing pack $(PRESET)
-
-# No archive is in git or on the web: each comes from a machine that rendered, where make data-pack made it.
-data-unpack: $(STAMP) ## Unpack them there, once data/packs has both archives of PRESET and their notes, copied by you
-	$(PY) -m mmgsd.extras.packing unpack $(PRESET)
-
 data-sample: $(STAMP) ## Copy 24 images of each object of PRESET into data/sample
-	$(PY) -m mmgsd.extras.packing sample $(PRESET)
+	$(PY) -m mmgsd.extras.sampling $(PRESET)
 
 weights: $(STAMP) ## Put the models of PRESET into data/weights, in half precision and with a card each
 	$(PY) -m mmgsd.extras.shipping $(PRESET)

@@ -6,8 +6,9 @@ import asyncio
 import contextlib
 import sys
 import time
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from concurrent.futures import CancelledError, ThreadPoolExecutor
+from typing import Any
 
 from dask.distributed import Client, Future, Security, wait
 from distributed.comm import connect
@@ -34,6 +35,21 @@ async def _greet(scheduler: str) -> None:
     """A client would wait for ever where somebody listens and says nothing."""
     comm = await connect(scheduler, timeout=PATIENCE, **Security().get_connection_args("client"))
     comm.abort()
+
+
+@contextlib.contextmanager
+def run_tasks(
+    client: Client, function: Callable[[Any], Any], tasks: Mapping[str, Any], *, retries: int = 0
+) -> Iterator[Iterator[tuple[str, Any]]]:
+    """Names and results of a function of each task, as they are done.
+
+    After an error or a Ctrl-C none of the rest is begun.
+    """
+    futures = {client.submit(function, task, pure=False, retries=retries): name for name, task in tasks.items()}
+    try:
+        yield ((futures.pop(future), future.result()) for future in wait_for_each(client, list(futures)))
+    finally:
+        client.cancel(list(futures))
 
 
 def wait_for_each(client: Client, futures: Collection[Future]) -> Iterator[Future]:

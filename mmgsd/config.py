@@ -41,7 +41,7 @@ Config = TypeVar("Config", bound="RenderConfig | TrainConfig | EvaluateConfig")
 def _check_object(name: str) -> None:
     """The cloth, the rope, or a name that an object of the user's own may have, whether its file is there yet or not.
 
-    Where it is needed and missing, `mmgsd.scene.sheet.load_sheet` gives the nearest name.
+    Where it is needed and missing, `mmgsd.scene.objects.planar_object.load_planar_object` gives the nearest name.
     """
     accepted = (f"{', '.join(map(repr, OBJECTS))} or the name of a file in data/objects: up to 60 letters, digits, "
                 "- and _, a letter first")  # fmt: skip
@@ -67,7 +67,7 @@ class RenderConfig:
     under hard light, seen obliquely, with prints, hems and stickers on the object, or without it (`mmgsd.scene`).
     """
 
-    object: str = "cloth"  # or "rope", or the name of a file in data/objects (see `mmgsd.scene.sheet`)
+    object: str = "cloth"  # or "rope", or the name of a file in data/objects (see `mmgsd.scene.objects.planar_object`)
     train_images: int = 60
     test_images: int = 20
     views: int = 10  # images of one simulation, each with its own camera, light and material

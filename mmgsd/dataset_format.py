@@ -22,7 +22,7 @@ TABLES = ("dataset.json", "labels.parquet")
 REQUIRED_COLUMNS = ("file", "mask", "split", "episode", "view", "xy", "visible", "intrinsics", "camera_pose")
 REQUIRED_KEYS = ("format", "object", "size", "symmetry", "default_group", "config", "images", "versions")
 LARGEST = 8192  # px that a side of an image may have
-REMEDY = "copy, unpack or render the data set again (overwrite=True)"
+REMEDY = "copy or render the data set again (overwrite=True)"
 
 IMAGE, MASK = (re.compile(rf"{place}/(?!\.)[A-Za-z0-9_.-]+\.{ending}") for place, ending in
                (("images", "webp"), ("masks", "png")))  # fmt: skip

@@ -26,7 +26,7 @@ def draw_view() -> SimpleNamespace:
 
 
 def run_child(job: dict, folder: Path) -> tuple[int, str]:
-    """In place of `rendering.run_child`: writes the archive of a job's views."""
+    """In place of `stage.run_child`: writes the archive of a job's views."""
     view, buffer, labels = draw_view(), io.BytesIO(), []
     with zipfile.ZipFile(buffer, "w") as archive:
         archive.comment = job["mark"].encode()

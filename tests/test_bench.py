@@ -13,9 +13,8 @@ import pytest
 from browser import CHROMIUM
 from conftest import write_tiny_dataset
 
-from mmgsd.config import OBJECTS, EvaluateConfig, load_preset
+from mmgsd.config import OBJECTS, load_preset
 from mmgsd.experiments import configure_model
-from mmgsd.extras.packing import pack_dataset
 from mmgsd.learn.training import train_model
 from mmgsd.paths import Paths
 
@@ -26,13 +25,12 @@ BROWSER = pytest.mark.skipif(CHROMIUM is None, reason="needs the program chromiu
 
 @pytest.fixture(scope="module")
 def smoke(tmp_path_factory: pytest.TempPathFactory) -> Paths:
-    """Both objects' synthetic data, a trained MMGSD of each, and the packed data."""
+    """Both objects' synthetic data, and a trained MMGSD of each."""
     paths = Paths(tmp_path_factory.mktemp("bench"), "smoke")
     for name in OBJECTS:
         data = write_tiny_dataset(paths.generated, object=name, n_train=8, n_test=4)
         config = configure_model(load_preset("smoke"), name, "mmgsd")
         train_model(config, data, paths.model(config), device="cpu", progress=False)
-        pack_dataset(data, paths.root / "data" / "packs" / f"smoke-{name}.zip", progress=False)
     return paths
 
 
@@ -59,7 +57,6 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> Calla
     pytest.param("explorer", ("1",), {}, "ms from click to picture", marks=BROWSER),
     ("learning", ("--preset", "smoke", "--minutes", "0.0001", "--", "batch=2"), {"PACE_STEPS": 1}, "cloth: "),
     ("matching", ("2", "smoke"), {"PLAIN": 2, "DRAWN": 500}, "x arg-min"),
-    ("packing", ("smoke", "smoke"), {"QUESTIONS": EvaluateConfig(pairs=2, points=2)}, "px packed"),
     ("rendering", ("2", "1"), {"EPISODES": 1, "OBJECTS": ("rope",)}, "rope "),
 ])  # fmt: skip
 def test_a_bench_runs(run: Callable, smoke: Paths, name: str, arguments: tuple, constants: dict, said: str) -> None:
@@ -74,7 +71,7 @@ def test_every_bench_is_run() -> None:
 
 @pytest.mark.parametrize(("name", "missing"), [
     ("clutter", "smoke/cloth/dataset.json"), ("learning", "paper/cloth/dataset.json"),
-    ("matching", "quick/cloth/dataset.json"), ("packing", "paper/cloth/dataset.json"),
+    ("matching", "quick/cloth/dataset.json"),
 ])  # fmt: skip
 def test_a_bench_says_which_data_it_lacks(run: Callable, tmp_path: Path, name: str, missing: str) -> None:
     with pytest.raises(ValueError, match=f"there is no data/generated/{missing} yet: run 01_render_data"):
@@ -88,11 +85,8 @@ def test_a_bench_lacks_something_in_one_sentence(tmp_path: Path) -> None:
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
 
 
-@pytest.mark.parametrize(("name", "made"), [("matching", "model"), ("packing", "pack")])
-def test_a_bench_says_which_model_or_archive_it_lacks(
-    run: Callable, smoke: Paths, tmp_path: Path, name: str, made: str
-) -> None:
+def test_a_bench_says_which_model_it_lacks(run: Callable, smoke: Paths, tmp_path: Path) -> None:
     for object in OBJECTS:
         shutil.copytree(smoke.dataset(object), Paths(tmp_path, "smoke").dataset(object))
-    with pytest.raises(ValueError, match=f"there is no data/.*{made}.* yet: run"):
-        run(name, tmp_path, *({"matching": ("2", "smoke"), "packing": ("smoke", "smoke")}[name]))
+    with pytest.raises(ValueError, match="there is no data/.*model.* yet: run"):
+        run("matching", tmp_path, "2", "smoke")

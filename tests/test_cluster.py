@@ -12,7 +12,7 @@ from dask.distributed import Client, LocalCluster
 
 from mmgsd import cluster
 from mmgsd.cluster import open_client, wait_for_each
-from mmgsd.scene.rendering import _unchanged_environment
+from mmgsd.scene.stage import _unchanged_environment
 
 
 @pytest.fixture

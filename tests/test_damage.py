@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 import shutil
@@ -18,7 +19,7 @@ from safetensors.torch import load_file
 from mmgsd.config import EvaluateConfig, TrainConfig, load_preset
 from mmgsd.dataset import check_dataset
 from mmgsd.dataset_format import TABLES
-from mmgsd.extras import packing, shipping
+from mmgsd.extras import shipping
 from mmgsd.files import DamagedFileError
 from mmgsd.learn import training
 from mmgsd.learn.checkpoints import CHECKPOINT, WEIGHTS, describe_run
@@ -79,7 +80,7 @@ def of_data_set(name: str) -> Callable[..., None]:
     def use(folder: Path, damage: Callable[[bytes], bytes], dataset: Path, model: Path) -> None:
         copy = shutil.copytree(dataset, folder / "cloth")
         info = json.loads((copy / TABLES[0]).read_text())
-        digest = packing.hashlib.sha256((copy / TABLES[1]).read_bytes()).hexdigest()
+        digest = hashlib.sha256((copy / TABLES[1]).read_bytes()).hexdigest()
         (copy / TABLES[0]).write_text(json.dumps({**info, "labels_sha256": digest}))
         path = copy / name
         path.write_bytes(damage(path.read_bytes()))
@@ -149,16 +150,6 @@ def use_figure_data(folder: Path, damage: Callable[[bytes], bytes], dataset: Pat
     load_figure_data(path)
 
 
-def of_pack(ending: str) -> Callable[..., None]:
-    def use(folder: Path, damage: Callable[[bytes], bytes], dataset: Path, model: Path) -> None:
-        packing.pack_dataset(dataset, folder / "cloth.zip", progress=False)
-        path = folder / f"cloth{ending}"
-        path.write_bytes(damage(path.read_bytes()))
-        packing.unpack_dataset(folder / "cloth.zip", folder / "back")
-
-    return use
-
-
 def use_shipped(folder: Path, damage: Callable[[bytes], bytes], dataset: Path, model: Path) -> None:
     (folder / "cloth.safetensors").write_bytes(damage((model / WEIGHTS).read_bytes()))
     shipping.restore_model(folder / "cloth.safetensors", folder / "model", CONFIG)
@@ -178,8 +169,6 @@ REFUSED = {
     "results for the report": (of_results(lambda root: report.write_report("smoke", root)), "rmse.json|results"),
     "results for the README": (of_results(fill_table), "rmse.json"),
     "data of figures": (use_figure_data, "figures.safetensors"),
-    "pack": (of_pack(".zip"), "cloth.zip"),
-    "note of a pack": (of_pack(".json"), "cloth.(json|zip)"),
 }  # fmt: skip
 MAY_STAY_VALID = ("bit flipped", "lacks a part")  # as another number of a JSON file
 

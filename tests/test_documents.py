@@ -69,7 +69,7 @@ def test_commands_name_modules_notebooks_and_targets_that_exist(path: Path) -> N
         assert notebook == "NAME.ipynb" or (ROOT / "notebooks" / notebook).is_file(), notebook
     for target in re.findall(r"(?:^|`)make ([a-z][a-z-]*)", text, re.MULTILINE):
         assert target in targets, target
-    for file in re.findall(r"`((?:mmgsd|tests|data/(?:results|sample|weights|objects|packs))/[\w/.]*)`", text):
+    for file in re.findall(r"`((?:mmgsd|tests|data/(?:results|sample|weights|objects))/[\w/.]*)`", text):
         assert (ROOT / file).exists(), file
 
 
@@ -151,7 +151,7 @@ def test_extras_exist() -> None:
 def test_the_lines_of_python_run(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
     rendered = []
-    monkeypatch.setattr("mmgsd.scene.rendering.render_dataset", lambda config, *args, **how: rendered.append(config))
+    monkeypatch.setattr("mmgsd.scene.stage.render_dataset", lambda config, *args, **how: rendered.append(config))
     names: dict[str, object] = {}
     for name in ("README.md", "docs/your-photographs.md"):
         text = (ROOT / name).read_text("utf-8")

@@ -1,1 +1,1 @@
-"""The explorer, ONNX, packing and shipping: to be skipped on first reading."""
+"""The explorer, ONNX, shipping and the sample: to be skipped on first reading."""

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from mmgsd.checks import check_choice
 from mmgsd.config import DEFAULT_GROUP, load_preset
 from mmgsd.experiments import configure_model, get_colour
 from mmgsd.fold.demonstration import Look
@@ -64,12 +63,6 @@ POLICIES = {
 
 
 SHIPPED = tuple(policy for policy in POLICIES.values() if not policy.trained and policy.name != "nothing")
-
-
-def find_policy(name: str) -> Policy:
-    """The policy of a name; ValueError, which names the accepted, for any other."""
-    check_choice("policy", name, tuple(POLICIES))
-    return POLICIES[name]
 
 
 @cache

@@ -39,17 +39,12 @@ def mmgsd(squared_distances: Tensor, target: Tensor) -> Tensor:
     """Cross-entropy of p = softmax(-distance²) with the mixture ``target``, both (..., C); mean over the queries.
 
     Queries whose target is 0 (no match in the image) do not count. Paper section "Symmetric Distributional Loss",
-    with the sign of its exponent corrected.
+    with the sign of its exponent corrected. With one mode in ``target`` it is the unimodal loss (Florence 2020).
     """
     _check_same_shape(squared_distances, target)
     matched = target.sum(-1) > 0
     loss = -(target * torch.log_softmax(-squared_distances, -1)).sum(-1)
     return (loss * matched).sum() / matched.sum().clamp(min=1)
-
-
-def unimodal(squared_distances: Tensor, target: Tensor) -> Tensor:
-    """The same cross-entropy with a target of one Gaussian (Florence 2020): give ``compute_target`` one mode."""
-    return mmgsd(squared_distances, target)
 
 
 def pcl(

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import cv2
@@ -108,18 +107,6 @@ class BaselineMatcher(FeatureMatcher):
     def describe(self, image: np.ndarray, xy: np.ndarray) -> np.ndarray:
         """As `compute_descriptors`."""
         return compute_descriptors(image, xy, method=self.method)
-
-
-def compute_baseline_heatmap(
-    image0: np.ndarray, image1: np.ndarray, xy: np.ndarray, mask1: np.ndarray, *, method: str, stride: int = STRIDE_PX
-) -> tuple[np.ndarray, np.ndarray]:
-    """`compute_described_heatmap` of a method in BASELINES.
-
-    ValueError for another.
-    """
-    check_choice("method", method, BASELINES)
-    describe = partial(compute_descriptors, method=method)
-    return compute_described_heatmap(image0, image1, xy, mask1, describe=describe, stride=stride)
 
 
 def compute_described_heatmap(

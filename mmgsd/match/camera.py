@@ -12,28 +12,12 @@ def compute_rays(xy: ArrayLike, intrinsics: ArrayLike) -> np.ndarray:
     ``intrinsics`` as `read_intrinsics` takes them. Multiplied by z / ray z it is the point at depth z. A pixel that is
     NaN gives NaN. ValueError for other shapes.
     """
-    xy, matrix = _check(xy, 2, "xy"), read_intrinsics(intrinsics)
+    xy, matrix = np.asarray(xy, float), read_intrinsics(intrinsics)
+    if xy.ndim < 1 or xy.shape[-1] != 2:
+        raise ValueError(f"xy must have shape (…, 2), got {xy.shape}")
     homogeneous = np.concatenate([xy, np.ones_like(xy[..., :1])], -1)
     rays = homogeneous @ np.linalg.inv(matrix).T
     return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
-
-
-def compute_pixels(points: ArrayLike, intrinsics: ArrayLike) -> np.ndarray:
-    """Pixels (…, 2) of rays or points (…, 3) in the camera's frame, any unit; NaN where z is not in front of it.
-
-    The inverse of `compute_rays`. ValueError for other shapes.
-    """
-    points, matrix = _check(points, 3, "points"), read_intrinsics(intrinsics)
-    projected = points @ matrix.T
-    depth = np.where(points[..., 2:] > 0, projected[..., 2:], np.nan)
-    return projected[..., :2] / depth
-
-
-def _check(values: np.ndarray, last: int, name: str) -> np.ndarray:
-    values = np.asarray(values, float)
-    if values.ndim < 1 or values.shape[-1] != last:
-        raise ValueError(f"{name} must have shape (…, {last}), got {values.shape}")
-    return values
 
 
 def read_intrinsics(intrinsics: ArrayLike) -> np.ndarray:

@@ -23,7 +23,7 @@ from mmgsd.checks import read_count, read_flag
 from mmgsd.config import EvaluateConfig
 from mmgsd.dataset import Dataset, hold_out, join_datasets, load_dataset, load_parts, sample_pairs
 from mmgsd.learn.checkpoints import load_metadata, read_tensors, write_tensors
-from mmgsd.match.calibration import LEVELS, Calibration, Modes, compute_unit, parse_calibration
+from mmgsd.match.calibration import LEVELS, Calibration, Modes, compute_unit
 from mmgsd.match.matcher import Matcher
 from mmgsd.match.weights import PLACES
 from mmgsd.measure.questions import ask, choose_points, describe, measure_mean_error, model_answer
@@ -136,12 +136,6 @@ def describe_places(matcher: Matcher, data: Dataset, *, pictures: int = PICTURES
     numbers = torch.arange(data.n_points)
     nearest = (numbers[:, None] - numbers[known]).abs().argmin(1)
     return mean[known][nearest].float()
-
-
-def read_calibration(weights: Path | str) -> Calibration | None:
-    """What a file of weights says its modes hold, None where it says nothing; ValueError where that is damaged."""
-    text = load_metadata(weights).get("calibration")
-    return None if text is None else parse_calibration(text)
 
 
 @own_numerics()

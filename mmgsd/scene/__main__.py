@@ -2,10 +2,10 @@
 
 A job with ``states`` makes each of them (`mmgsd.scene.folding`) and writes it to its ``out``. Any other renders: it
 holds ``config`` (the fields of ``RenderConfig``), ``split``, ``episodes`` as [[episode, views], …], ``sheet``
-(None, or the object as `Sheet.to_dict` gives it), ``out``, the archive to write, and where it is known ``mark``, which
-the archive keeps, and ``parent``, the process with which this one ends. Blender lives here alone: its memory goes with
-the process, and its chatter stays out of the parent's output. The exit code is 1 after an exception, its traceback on
-stderr.
+(None, or the object as `PlanarObject.to_dict` gives it), ``out``, the archive to write, and where they are known
+``mark``, the job's hash, which the archive keeps, and ``parent``, the process with which this one ends. Blender lives
+here alone: its memory goes with the process, and its chatter stays out of the parent's output. The exit code is 1 after
+an exception, its traceback on stderr.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from typing import Any
 from mmgsd.config import RenderConfig, from_dict
 from mmgsd.files import writing
 from mmgsd.images import encode_image, encode_mask
-from mmgsd.scene.sheet import Sheet
+from mmgsd.scene.objects.planar_object import PlanarObject
 
 PR_SET_PDEATHSIG = 1  # of Linux: which signal a process gets when its parent ends
 
@@ -57,12 +57,12 @@ def render_job(job: dict[str, Any]) -> Path:
     with one_core():
         from mmgsd.scene.episode import render_episode  # bpy is loaded once the output is silenced
 
-    sheet = Sheet.from_dict(job["sheet"]) if job.get("sheet") else None
+    planar = PlanarObject.from_dict(job["sheet"]) if job.get("sheet") else None
     config, out = from_dict(RenderConfig, job["config"]), Path(job["out"])
     with writing(out) as aside, zipfile.ZipFile(aside, "w", zipfile.ZIP_STORED) as archive:
         archive.comment, labels = job.get("mark", "").encode(), []
         for episode, n_views in job["episodes"]:
-            for i, view in enumerate(render_episode(config, job["split"], episode, n_views, sheet)):
+            for i, view in enumerate(render_episode(config, job["split"], episode, n_views, planar)):
                 written = write_view(archive, episode, i, view)
                 labels.append({"episode": episode, "view": i, "split": job["split"], **written})
         _add(archive, "labels.json", json.dumps(labels).encode())
@@ -124,7 +124,7 @@ def silenced() -> Iterator[None]:
     """Send what C code prints to nowhere; Python's own stderr is back before a traceback is printed."""
     sys.stdout.flush()
     sys.stderr.flush()
-    kept = [os.dup(fd) for fd in (1, 2)]
+    original_fds = [os.dup(fd) for fd in (1, 2)]
     nowhere = os.open(os.devnull, os.O_WRONLY)
     try:
         for fd in (1, 2):
@@ -132,7 +132,7 @@ def silenced() -> Iterator[None]:
         yield
     finally:
         sys.stdout.flush()
-        for fd, original in zip((1, 2), kept, strict=True):
+        for fd, original in zip((1, 2), original_fds, strict=True):
             os.dup2(original, fd)
             os.close(original)
         os.close(nowhere)

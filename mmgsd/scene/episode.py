@@ -8,55 +8,50 @@ import bpy
 import numpy as np
 
 from mmgsd.config import OBJECTS, SCENES, RenderConfig
-from mmgsd.scene import randomize, render
-from mmgsd.scene.render import DeformedObject, View
-from mmgsd.scene.sheet import Sheet
+from mmgsd.scene import blender, randomize
+from mmgsd.scene.blender import DeformedObject, View
+from mmgsd.scene.objects.planar_object import PlanarObject
 
 SPLITS = ("train", "test")
+FLOOR = 6.0  # m from its centre to each side
 
 
 def render_episode(
-    config: RenderConfig, split: str, episode: int, n_views: int, sheet: Sheet | None = None
+    config: RenderConfig, split: str, episode: int, n_views: int, planar: PlanarObject | None = None
 ) -> list[View]:
-    """Create, populate, render and label ``n_views`` views of one deformation of the cloth, the rope or a ``sheet``.
+    """Create, populate, render and label ``n_views`` views of one deformation of the cloth, the rope or a ``planar``.
 
     The same arguments give the same pixels in any process. ValueError for an unknown split.
     """
     if split not in SPLITS:
         raise ValueError(f"split must be one of {', '.join(SPLITS)}, got {split!r}")
-    kind = OBJECTS.index(config.object) if sheet is None else zlib.crc32(sheet.name.encode())
+    kind = OBJECTS.index(config.object) if planar is None else zlib.crc32(planar.name.encode())
     around = [SCENES.index(config.scene)] if config.scene != "plain" else []  # the plain scene's stream is as it was
     rng = np.random.default_rng([config.seed, kind, SPLITS.index(split), episode, *around])
-    scene = render.reset_scene()
-    deformed = build_object(rng, config, sheet)
-    size = config.size if sheet is None else sheet.size
-    render.setup_cycles(scene, size, config.samples)
-    bvh = render.build_bvh(deformed.mesh)
+    scene = blender.reset_scene()
+    deformed = build_object(rng, config, planar)
+    size = config.size if planar is None else planar.size
+    blender.setup_cycles(scene, size, config.samples)
+    bvh = blender.build_bvh(deformed.mesh)
     if config.scene == "workspace":
-        from mmgsd.scene.workspace import render_view
+        from mmgsd.scene.workspace.view import render_view
 
         return [render_view(rng, config, size, scene, deformed, bvh) for _ in range(n_views)]
-    floor = add_floor()
+    floor = blender.add_floor("floor", FLOOR)
     return [_render_view(rng, config, size, scene, deformed, floor, bvh) for _ in range(n_views)]
 
 
-def build_object(rng: np.random.Generator, config: RenderConfig, sheet: Sheet | None = None) -> DeformedObject:
+def build_object(rng: np.random.Generator, config: RenderConfig, planar: PlanarObject | None = None) -> DeformedObject:
     """Add a randomly deformed object of the configured kind to the current scene."""
-    if sheet is not None:
-        from mmgsd.scene.cloth import build_sheet
+    if planar is not None:
+        from mmgsd.scene.objects.cloth import build_planar_object
 
-        return build_sheet(rng, sheet)
+        return build_planar_object(rng, planar)
     if config.object == "cloth":
-        from mmgsd.scene.cloth import build_cloth as build
+        from mmgsd.scene.objects.cloth import build_cloth as build
     else:
-        from mmgsd.scene.rope import build_rope as build
+        from mmgsd.scene.objects.rope import build_rope as build
     return build(rng, config)
-
-
-def add_floor() -> bpy.types.Object:
-    """Add the plane z = 0, 12 m wide, to the current scene."""
-    corners = np.array([[-6, -6, 0], [6, -6, 0], [6, 6, 0], [-6, 6, 0]], dtype=float)
-    return render.add_mesh("floor", corners, np.array([[0, 1, 2, 3]]))
 
 
 def _render_view(
@@ -66,19 +61,19 @@ def _render_view(
     scene: bpy.types.Scene,
     deformed: DeformedObject,
     floor: bpy.types.Object,
-    bvh: render.BVHTree,
+    bvh: blender.BVHTree,
 ) -> View:
     camera, turn = randomize.draw_camera(rng, deformed.points, size, config.rotation_deg)
-    render.place_camera(scene, camera)
+    blender.place_camera(scene, camera)
     randomize.draw_light(rng, scene)
     colour, background = randomize.draw_background(rng, floor)
     texture = randomize.draw_object_material(rng, deformed.mesh, colour)
-    image, mask = render.render_image(scene, seed=int(rng.integers(2**31)))
+    image, mask = blender.render_image(scene, seed=int(rng.integers(2**31)))
     return View(
         image=image,
         mask=mask,
         xy=camera.project(deformed.points).astype(np.float32),
-        visible=render.find_visible(deformed, bvh, camera),
+        visible=blender.find_visible(deformed, bvh, camera),
         intrinsics=camera.intrinsics,
         camera_pose=camera.pose,
         info={**deformed.info, "turn_deg": turn, "texture": texture, "background": background},

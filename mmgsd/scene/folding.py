@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,11 +16,11 @@ import numpy as np
 from dask.distributed import Client
 
 from mmgsd.checks import check, check_choice, read_count, read_flag
-from mmgsd.cluster import wait_for_each
+from mmgsd.cluster import run_tasks
 from mmgsd.files import DamagedFileError, scratch_folder, set_aside, write_bytes
 from mmgsd.fold.tasks import GROUNDS, STARTS, Move, Task, find_task, place_truth
 from mmgsd.progress import ProgressBar
-from mmgsd.scene.rendering import RenderError, connect, explain, run_child
+from mmgsd.scene.stage import connect, run_job
 from mmgsd.scene.state import State, read_state
 
 __all__ = ["State", "act_job", "demonstration_job", "look_job", "read_state", "run_jobs", "start_job", "true_moves"]
@@ -132,17 +131,13 @@ def _run_missing(client: Client, jobs: dict[str, dict], files: dict[str, Path], 
     threads = max(1, sum(client.nthreads().values()))
     size = min(JOBS_A_BATCH, -(-len(names) // threads))
     batches = [names[i : i + size] for i in range(0, len(names), size)]
-    futures = [client.submit(_make_batch, {name: _pack(jobs[name]) for name in batch}, pure=False, retries=1)
-               for batch in batches]  # fmt: skip
-    try:
-        with ProgressBar(total=len(names), desc="fold", unit="state", disable=not progress) as bar:
-            for future in wait_for_each(client, futures):
-                made = future.result()
-                for name, data in made.items():
-                    write_bytes(files[name], data)
-                bar.update(len(made))
-    finally:
-        client.cancel(futures)  # after an error or a Ctrl-C, none of the rest is begun
+    tasks = {batch[0]: {name: _pack(jobs[name]) for name in batch} for batch in batches}
+    bar = ProgressBar(total=len(names), desc="fold", unit="state", disable=not progress)
+    with bar, run_tasks(client, _make_batch, tasks, retries=1) as results:
+        for _, made in results:
+            for name, data in made.items():
+                write_bytes(files[name], data)
+            bar.update(len(made))
 
 
 def _pack(job: dict) -> tuple[dict, bytes]:
@@ -157,7 +152,5 @@ def _make_batch(jobs: dict[str, tuple[dict, bytes]]) -> dict[str, bytes]:
         for i, (job, before) in enumerate(jobs.values()):
             state = write_bytes(folder / f"before{i}.npz", before) if before else ""
             states.append(job | {"state": str(state), "out": str(folder / f"after{i}.npz")})
-        code, said = run_child({"states": states, "parent": os.getpid()}, folder)
-        if code:
-            raise RenderError(f"folding {', '.join(jobs)} {explain(code)}:\n{said[-2000:]}")
-        return {name: Path(one["out"]).read_bytes() for name, one in zip(jobs, states, strict=True)}
+        outs = [Path(one["out"]) for one in states]
+        return dict(zip(jobs, run_job({"states": states}, folder, f"folding {', '.join(jobs)}", outs), strict=True))

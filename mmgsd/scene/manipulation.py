@@ -22,17 +22,19 @@ from scipy.ndimage import binary_dilation
 
 from mmgsd.config import IMAGE_SIZE
 from mmgsd.fold.tasks import Task, find_task
-from mmgsd.scene import cloth, randomize, render, rope
-from mmgsd.scene.episode import add_floor
-from mmgsd.scene.grounds import Site, draw_ground
-from mmgsd.scene.materials import paint_object
-from mmgsd.scene.meshes import SPACING
-from mmgsd.scene.render import Camera, DeformedObject
+from mmgsd.scene import blender, randomize
+from mmgsd.scene.blender import Camera, DeformedObject
+from mmgsd.scene.episode import FLOOR
+from mmgsd.scene.geometry import find_middle, spin
+from mmgsd.scene.objects import cloth, rope
+from mmgsd.scene.objects.meshes import SPACING
+from mmgsd.scene.objects.rope_shape import LENGTH, OwnPart, RopeShape, sample_rope
 from mmgsd.scene.rope_pull import pull_rope
-from mmgsd.scene.rope_shape import LENGTH, OwnPart, RopeShape, sample_rope
 from mmgsd.scene.state import State, read_state, write_state
-from mmgsd.scene.things import add_things
-from mmgsd.scene.workspace import draw_light, find_seen, frame_points
+from mmgsd.scene.workspace.distractors import add_distractors
+from mmgsd.scene.workspace.materials import paint_object
+from mmgsd.scene.workspace.surfaces import Site, add_surfaces
+from mmgsd.scene.workspace.view import draw_light, frame_points, sample_ground_points
 
 SAMPLES = 1  # of Cycles, a pixel, as the rendered sets have
 MAX_OFFSET = 0.1  # m from the origin, along x and y, of a first state
@@ -105,14 +107,13 @@ def _begin_rope(rng: np.random.Generator, about: dict[str, Any]) -> tuple[np.nda
     along /= np.linalg.norm(along)
     centre = shape.centre.copy()
     centre[:, :2] = centre[:, :2] @ np.array([[along[0], -along[1]], [along[1], along[0]]])
-    centre[:, :2] -= (centre[:, :2].min(0) + centre[:, :2].max(0)) / 2
+    centre[:, :2] -= find_middle(centre[:, :2])
     return centre, shape.thickness
 
 
 def _turn(rng: np.random.Generator, vertices: np.ndarray) -> np.ndarray:
     """Vertices (V, 3) turned about z by any angle, and a little aside."""
-    cosine, sine = np.cos(angle := rng.uniform(0, 2 * np.pi)), np.sin(angle)
-    turned = vertices @ np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]])
+    turned = vertices @ spin(rng.uniform(0, 2 * np.pi)).T
     turned[:, :2] += rng.uniform(-MAX_OFFSET, MAX_OFFSET, size=2)
     return turned
 
@@ -120,13 +121,13 @@ def _turn(rng: np.random.Generator, vertices: np.ndarray) -> np.ndarray:
 # Acts. --------------------------------------------------------------------------------------------------------------
 
 
-def act(state: State, moves: Moves, mark: str) -> State:
+def act(state: State, moves: Moves, job_hash: str) -> State:
     """The next look, after all ``moves`` (px) were made at once.
 
     A ray that misses the object grasps nothing. What physics spoils is said in the new state's ``fault``; a state that
     has one already stays as it is.
     """
-    about = state.about | {"look": state.about["look"] + 1, "mark": mark}
+    about = state.about | {"look": state.about["look"] + 1, "mark": job_hash}
     if about["fault"]:
         return dataclasses.replace(state, about=about)
     camera = Camera(state.intrinsics, state.camera_pose, state.mask.shape[::-1])
@@ -148,7 +149,7 @@ def find_cloth_fault(vertices: np.ndarray) -> str:
     """What physics did to a cloth (V, 3) m that no cloth would bear; empty where nothing."""
     if not np.isfinite(vertices).all():
         return "nowhere"
-    return _find_stretch(cloth.measure_stretch(cloth.square_sheet(), vertices))
+    return _find_stretch(cloth.measure_stretch(cloth.square_cloth(), vertices))
 
 
 def find_rope_fault(centre: np.ndarray) -> str:
@@ -169,23 +170,23 @@ def move_cloth(vertices: np.ndarray, grasps: Sequence[tuple[Sequence[int], np.nd
     """
     if not grasps:
         return vertices
-    sheet = cloth.square_sheet()
+    planar = cloth.square_cloth()
     furthest = max(np.linalg.norm(shift) for _, shift in grasps)
-    frames, held = LEAST_FRAMES + int(FRAMES_A_METRE * furthest), {}
+    frames, grasped = LEAST_FRAMES + int(FRAMES_A_METRE * furthest), {}
     for group, shift in grasps:
         lift, low = max(0.05, LIFT * np.linalg.norm(shift)), vertices[group, 2].min()
         path = cloth.arc_path(np.append(shift, LAID_AT - low), lift, frames)
-        held |= {vertex: cloth.Grasp(vertex, path) for vertex in group if vertex not in held}
-    carried = cloth.simulate(sheet, vertices, list(held.values()), frames, friction=FRICTION)
+        grasped |= {vertex: cloth.Grasp(vertex, path) for vertex in group if vertex not in grasped}
+    carried = cloth.simulate(planar, vertices, list(grasped.values()), frames, friction=FRICTION)
     if not np.isfinite(carried).all():
         return carried
-    return cloth.simulate(sheet, carried, [], SETTLE_FRAMES, friction=FRICTION)
+    return cloth.simulate(planar, carried, [], SETTLE_FRAMES, friction=FRICTION)
 
 
 def _grasp_cloth(vertices: np.ndarray, camera: Camera, moves: Moves) -> list[tuple[list[int], np.ndarray]]:
     """Vertices that each gripper takes, and by what shift (2,) m it carries them; none where its ray misses."""
     lying = vertices + (0, 0, 0.001 - vertices[:, 2].min())  # as it is rendered
-    faces, grasps = cloth.square_sheet().faces, []
+    faces, grasps = cloth.square_cloth().faces, []
     tree = BVHTree.FromPolygons(lying.tolist(), faces.tolist())
     for pick, place in moves:
         hit, _, face, _ = tree.ray_cast(Vector(camera.pose[:3, 3]), Vector(cast_ray(camera, pick)))
@@ -242,9 +243,9 @@ def meet_table(camera: Camera, xy: Sequence[float]) -> np.ndarray | None:
 # Looks. -------------------------------------------------------------------------------------------------------------
 
 
-def look_again(state: State, again: int, mark: str) -> State:
+def look_again(state: State, again: int, job_hash: str) -> State:
     """The same state, seen by the camera of another number than the rollout's own, which is 0; at rest meanwhile."""
-    about = state.about | {"again": again, "mark": mark}
+    about = state.about | {"again": again, "mark": job_hash}
     if about["fault"]:
         return dataclasses.replace(state, about=about)
     return _look(state.vertices, state.first, about)
@@ -252,15 +253,15 @@ def look_again(state: State, again: int, mark: str) -> State:
 
 def _look(vertices: np.ndarray, first: np.ndarray | None, about: dict[str, Any]) -> State:
     """Render and label the object; ``first`` (625, 3) m are the points of the rollout's first look, None for that."""
-    scene = render.reset_scene()
+    scene = blender.reset_scene()
     deformed = _add_object(vertices.astype(float), about)
     points = deformed.points.astype(np.float32)
     first = points if first is None else first
     room = find_room(first.astype(float), find_task(about["task"]))
     camera, turn = _draw_camera(room, about)
-    render.setup_cycles(scene, camera.size, SAMPLES)
-    render.place_camera(scene, camera)
-    visible = render.find_visible(deformed, render.build_bvh(deformed.mesh), camera)
+    blender.setup_cycles(scene, camera.size, SAMPLES)
+    blender.place_camera(scene, camera)
+    visible = blender.find_visible(deformed, blender.build_bvh(deformed.mesh), camera)
     image, mask = _render(scene, deformed, room, camera, turn, about)
     xy = camera.project(deformed.points).astype(np.float32)
     visible &= _is_near(mask, xy)  # a thing may stand before it
@@ -269,7 +270,7 @@ def _look(vertices: np.ndarray, first: np.ndarray | None, about: dict[str, Any])
 
 def _add_object(vertices: np.ndarray, about: dict[str, Any]) -> DeformedObject:
     if about["object"] == "cloth":
-        return cloth.hand_over(vertices, {})
+        return cloth.add_cloth(vertices, {})
     thickness = about["thickness"]
     shape = RopeShape(vertices, thickness, about["start"], np.empty((0, 2), dtype=int), 0.0)
     mesh = rope.add_parts(rope.build_parts(shape, rope.draw_lay(_stream(about, "lay"))))
@@ -278,7 +279,7 @@ def _add_object(vertices: np.ndarray, about: dict[str, Any]) -> DeformedObject:
 
 def find_room(points: np.ndarray, task: Task) -> np.ndarray:
     """Places (K, 3) m that a task may need, around its object's first points (625, 3) m: seen, and nothing on them."""
-    middle = np.append((points[:, :2].min(0) + points[:, :2].max(0)) / 2, 0.0)
+    middle = np.append(find_middle(points[:, :2]), 0.0)
     if task.name == "straighten":  # the rope may come to lie in any direction
         angle = np.linspace(0, 2 * np.pi, 64, endpoint=False)
         rings = [np.stack([r * np.cos(angle), r * np.sin(angle), 0 * angle], axis=1) for r in (0.85, 0.6, 0.3)]
@@ -310,11 +311,11 @@ def _render(
     rng, masked = _stream(about, "look"), None
     if about["ground"] == "plain":
         randomize.draw_light(rng, scene)
-        colour, _ = randomize.draw_background(rng, add_floor())
+        colour, _ = randomize.draw_background(rng, blender.add_floor("floor", FLOOR))
         randomize.draw_object_material(rng, deformed.mesh, colour)
     else:
         masked = _furnish(rng, scene, deformed, room, camera, turn, about)
-    image, mask = render.render_image(scene, seed=int(rng.integers(2**31)))
+    image, mask = blender.render_image(scene, seed=int(rng.integers(2**31)))
     if masked is not None:
         image[~mask] = masked
     return image, mask
@@ -328,10 +329,10 @@ def _furnish(
     colour, _ = paint_object(rng, deformed.mesh)
     slender = about["object"] == "rope"
     side = float(np.ptp(room[:, :2], axis=0).max()) if slender else cloth.EXTENT
-    site = Site(room, side, turn, find_seen(rng, camera), colour, about["thickness"] / 2, slender)
-    _, walls, masked = draw_ground(rng, site)
+    site = Site(room, side, turn, sample_ground_points(rng, camera), colour, about["thickness"] / 2, slender)
+    _, walls, masked = add_surfaces(rng, site)
     free = np.ones(len(room), dtype=bool)
-    add_things(rng, site, camera, free, beside=masked is None, walls=walls, over=False)
+    add_distractors(rng, site, camera, free, beside=masked is None, walls=walls, over=False)
     draw_light(rng, scene, side, np.append(site.middle, 0.0))
     return masked
 

@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import bpy
 import numpy as np
-from mathutils import Euler, Vector
+from mathutils import Euler
 
 from mmgsd.scene import SceneError
-from mmgsd.scene.render import Camera
-from mmgsd.scene.textures import (
-    BACKGROUNDS,
-    CLOTH_TEXTURES,
-    OBJECT_TEXTURES,
-    Colour,
-    Shader,
-    draw_colour,
-    draw_contrasting,
-)
+from mmgsd.scene.blender import Camera
+from mmgsd.scene.geometry import compute_direction
+from mmgsd.scene.lighting import add_lamp, aim_lamp, set_world
+from mmgsd.scene.sampling import log_uniform
+from mmgsd.scene.textures.colours import Colour, draw_colour, draw_contrasting
+from mmgsd.scene.textures.procedural import BACKGROUNDS, CLOTH_TEXTURES, OBJECT_TEXTURES, Shader
 
 MIN_SPAN = 0.8  # m seen across the image at least: a small heap stays small
 MAX_OUTSIDE = 0.05  # share of the material points that may fall out of the image
@@ -58,10 +54,7 @@ def _draw_pose(rng: np.random.Generator, points: np.ndarray, size: tuple[int, in
     centre = rotation[:, :2] @ aim
     centre = centre + rotation[:, 2] * (height - centre[2]) / rotation[2, 2]
     focal = size[0] * distance / width[0]
-    intrinsics = np.array([[focal, 0, (size[0] - 1) / 2], [0, focal, (size[1] - 1) / 2], [0, 0, 1]])
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, centre - distance * rotation[:, 2]
-    return Camera(intrinsics, pose, size)
+    return Camera.build(rotation, centre - distance * rotation[:, 2], focal, size)
 
 
 # Light. -------------------------------------------------------------------------------------------------------------
@@ -73,50 +66,18 @@ def draw_light(rng: np.random.Generator, scene: bpy.types.Scene) -> None:
     tint = rng.normal(scale=0.06)  # warm to cold
     colour = np.clip([1 + tint, 1.0, 1 - tint], 0, 2)
     set_world(scene, (*np.clip([1 - tint, 1, 1 + tint], 0, 2), 1.0), exposure * ambient)
-    elevation, azimuth = rng.uniform(np.radians(30), np.radians(85)), rng.uniform(0, 2 * np.pi)
-    towards = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
-    radiance = exposure * (1 - ambient) / np.sin(elevation)  # of a white sheet
+    direction = compute_direction(rng.uniform(np.radians(30), np.radians(85)), rng.uniform(0, 2 * np.pi))
     lamp, distance = _draw_lamp(rng, scene)
-    lamp.data.color = colour
-    lamp.data.energy = radiance * np.pi * (np.pi * distance**2 if lamp.data.type == "AREA" else 1.0)
-    lamp.location = distance * towards
-    lamp.rotation_euler = Vector(towards).to_track_quat("Z", "Y").to_euler()
-
-
-def set_world(scene: bpy.types.Scene, colour: Colour, strength: float) -> None:
-    """Light of one colour from all around, as bright as ``strength`` on a white sheet."""
-    if scene.world is None:
-        scene.world = bpy.data.worlds.new("world")
-        scene.world.use_nodes = True
-    background = scene.world.node_tree.nodes["Background"]
-    background.inputs["Color"].default_value, background.inputs["Strength"].default_value = colour, strength
+    aim_lamp(lamp, np.zeros(3), direction, distance, colour=colour, exposure=exposure * (1 - ambient))
 
 
 def _draw_lamp(rng: np.random.Generator, scene: bpy.types.Scene) -> tuple[bpy.types.Object, float]:
     """The scene's only lamp, replaced, and its distance from the origin in m."""
     if rng.random() < 0.5:
-        lamp = new_lamp(scene, "SUN")
-        lamp.data.angle = np.radians(np.exp(rng.uniform(np.log(0.5), np.log(40.0))))
+        lamp = add_lamp(scene, "SUN", np.radians(log_uniform(rng, 0.5, 40.0)))
     else:
-        lamp = new_lamp(scene, "AREA")
-        lamp.data.size = rng.uniform(0.2, 2.0)
+        lamp = add_lamp(scene, "AREA", rng.uniform(0.2, 2.0))
     return lamp, float(rng.uniform(1.8, 4.0))
-
-
-def remove_lamp() -> None:
-    """Put out the scene's lamp, if there is one."""
-    if "lamp" in bpy.data.objects:
-        bpy.data.lights.remove(bpy.data.objects["lamp"].data)  # takes the object with it
-
-
-def new_lamp(scene: bpy.types.Scene, kind: str) -> bpy.types.Object:
-    """Replace the scene's only lamp by a ``SUN`` or an ``AREA``."""
-    remove_lamp()
-    data = bpy.data.lights.new("lamp", kind)
-    data.cycles.use_multiple_importance_sampling = False  # sampled directly alone: less noise on matt surfaces
-    lamp = bpy.data.objects.new("lamp", data)
-    scene.collection.objects.link(lamp)
-    return lamp
 
 
 # Materials. -----------------------------------------------------------------------------------------------------------

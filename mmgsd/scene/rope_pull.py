@@ -11,8 +11,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mmgsd.scene.rope_relax import STEP, STRIDES, bend, limit_bends, near_pairs, push_apart
-from mmgsd.scene.rope_shape import LENGTH, resample
+from mmgsd.scene.objects.rope_relax import STEP, STRIDES, bend, limit_bends, near_pairs, push_apart
+from mmgsd.scene.objects.rope_shape import LENGTH, resample
 
 LIFT = 5.0  # diameters that grippers rise: a U-turn of the tightest bend passes under them
 STRIDE = 0.25  # diameters that the furthest gripper moves in a step

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from mmgsd.command import run_command
 from mmgsd.config import OBJECTS, RenderConfig
-from mmgsd.scene.rendering import render_dataset
+from mmgsd.scene.stage import render_dataset
 
 EPISODES = 4  # in one process
 SEED = 1234  # not a preset's: nobody trains on these
@@ -35,7 +35,7 @@ def timed(module, name, label):
 begin = time.perf_counter()
 with silenced():
     with one_core():
-        from mmgsd.scene import episode, render, randomize
+        from mmgsd.scene import blender, episode, randomize
     clock["start of Blender (once a process)"] = time.perf_counter() - begin
     timed(episode, "build_object", "shape (physics or geometry)")
     timed(render, "build_bvh", "labels: tree")

@@ -24,7 +24,7 @@ def test_a_task_grasps_points_that_the_object_has_and_starts_from_its_states(tas
 
 def test_halving_lays_the_first_row_on_the_last():
     row, column = np.divmod(np.arange(625), 25)
-    flat = np.stack([column / 24 - 0.5, 0.5 - row / 24], axis=1)  # as mmgsd.scene.cloth lays it
+    flat = np.stack([column / 24 - 0.5, 0.5 - row / 24], axis=1)  # as mmgsd.scene.objects.cloth lays it
     for move in TASKS["edge"].looks[0]:
         assert move.place == pytest.approx(flat[move.pick] * (1, -1))
     (unfold,) = TASKS["unfold"].looks[0]

@@ -118,7 +118,7 @@ def test_mmgsd_by_hand() -> None:
 
 def test_unimodal_by_hand() -> None:
     squared, target = torch.tensor([[0.0, math.log(3)]]), torch.tensor([[0.0, 1.0]])
-    assert losses.unimodal(squared, target).item() == pytest.approx(math.log(4))
+    assert losses.mmgsd(squared, target).item() == pytest.approx(math.log(4))
 
 
 def test_queries_without_a_match_do_not_count() -> None:

@@ -1,3 +1,5 @@
+from functools import partial
+
 import cv2
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ from mmgsd.match.baselines import (
     EXTRACTORS,
     BaselineMatcher,
     FeatureMatcher,
-    compute_baseline_heatmap,
+    compute_described_heatmap,
     compute_descriptors,
     compute_distances,
     compute_grid,
@@ -39,6 +41,11 @@ def xy():
     return np.stack([columns, rows], -1).reshape(-1, 2) + 0.25
 
 
+def compute_heatmap(image0, image1, xy, mask1, *, method, stride=STRIDE):
+    describe = partial(compute_descriptors, method=method)
+    return compute_described_heatmap(image0, image1, xy, mask1, describe=describe, stride=stride)
+
+
 def find_top(heatmap, grid):
     return grid.reshape(-1, 2)[heatmap.reshape(len(heatmap), -1).argmax(1)]
 
@@ -53,7 +60,7 @@ def turn(image, xy, degrees):
 def test_heatmap_is_a_distribution_on_the_object(method, image, mask, xy):
     half = mask.copy()
     half[:, :100] = False
-    heatmap, grid = compute_baseline_heatmap(image, image, xy, half, method=method, stride=STRIDE)
+    heatmap, grid = compute_heatmap(image, image, xy, half, method=method)
     assert heatmap.shape == (len(xy), 25, 30)
     assert heatmap.dtype == np.float32
     assert grid.shape == (25, 30, 2)
@@ -64,7 +71,7 @@ def test_heatmap_is_a_distribution_on_the_object(method, image, mask, xy):
 
 @pytest.mark.parametrize("method", BASELINES)
 def test_an_image_matches_itself(method, image, mask, xy):
-    heatmap, grid = compute_baseline_heatmap(image, image, xy, mask, method=method, stride=STRIDE)
+    heatmap, grid = compute_heatmap(image, image, xy, mask, method=method)
     errors = np.linalg.norm(find_top(heatmap, grid) - xy, axis=1)
     assert np.median(errors) <= 8  # the cell's own extent
 
@@ -73,7 +80,7 @@ def test_an_image_matches_itself(method, image, mask, xy):
 @pytest.mark.parametrize("degrees", [35, 90, -140])
 def test_a_turned_image_matches(method, degrees, image, mask, xy):
     turned, true = turn(image, xy, degrees)
-    heatmap, grid = compute_baseline_heatmap(image, turned, xy, mask, method=method, stride=STRIDE)
+    heatmap, grid = compute_heatmap(image, turned, xy, mask, method=method)
     errors = np.linalg.norm(find_top(heatmap, grid) - true, axis=1)
     assert np.median(errors) <= 8
 
@@ -110,7 +117,7 @@ def test_no_point_is_dropped_at_the_border(method, image):
 @pytest.mark.parametrize("method", [m for m in BASELINES if m not in EXTRACTORS])  # a network sees the border
 def test_a_plain_image_gives_a_uniform_heatmap(method, image, mask, xy):
     plain = np.full_like(image, 90)
-    heatmap, _ = compute_baseline_heatmap(plain, plain, xy[:3], mask, method=method, stride=STRIDE)
+    heatmap, _ = compute_heatmap(plain, plain, xy[:3], mask, method=method)
     np.testing.assert_allclose(heatmap, 1 / heatmap[0].size, rtol=0.02)  # DAISY's rounding
 
 
@@ -129,7 +136,7 @@ def test_grid_cells_lie_where_documented():
 
 
 def test_no_query_gives_an_empty_heatmap(image, mask):
-    heatmap, _ = compute_baseline_heatmap(image, image, np.zeros((0, 2)), mask, method="orb", stride=STRIDE)
+    heatmap, _ = compute_heatmap(image, image, np.zeros((0, 2)), mask, method="orb")
     assert heatmap.shape == (0, 25, 30)
 
 
@@ -155,7 +162,7 @@ def test_bad_arguments_are_named(change, message, image, mask, xy):
     arguments = {"image0": image, "image1": image, "xy": xy, "mask1": mask, "method": "orb", **change}
     method, stride = arguments.pop("method"), arguments.pop("stride", 8)
     with pytest.raises(ValueError, match=message):
-        compute_baseline_heatmap(**arguments, method=method, stride=stride)
+        compute_heatmap(**arguments, method=method, stride=stride)
 
 
 @pytest.mark.parametrize("method", BASELINES)

@@ -16,7 +16,7 @@ from mmgsd.config import TrainConfig
 from mmgsd.dataset import load_dataset
 from mmgsd.learn.checkpoints import load_metadata, read_tensors, write_tensors
 from mmgsd.learn.network import build_network, compute_cell_centres
-from mmgsd.match.calibration import LEVELS
+from mmgsd.match.calibration import LEVELS, parse_calibration
 from mmgsd.match.matcher import Matcher
 from mmgsd.match.mixture import Reading
 from mmgsd.measure import calibration
@@ -30,7 +30,6 @@ from mmgsd.measure.calibration import (
     check_calibration,
     find_quantiles,
     fit_calibration,
-    read_calibration,
 )
 from mmgsd.measure.questions import choose_points
 from mmgsd.measure.uncertainty import compute_coverage, get_distances, get_modes, measure_modes, recalibrate
@@ -104,14 +103,14 @@ def many_held_out(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_weights_are_calibrated_without_training(weights: Path, cloth_dataset: Path, many_held_out: None) -> None:
     tensors, note = read_tensors(weights)
-    assert read_calibration(weights) is None
+    assert "calibration" not in note
     assert calibrate_weights(weights, cloth_dataset, pairs=20, points=4, progress=False) == weights
     after, said = read_tensors(weights)
     assert after.keys() == tensors.keys()
     assert all(torch.equal(after[n], v) and after[n].dtype == v.dtype for n, v in tensors.items())
     assert {name: text for name, text in said.items() if name != "calibration"} == note
-    found = read_calibration(weights)
-    assert found == Matcher.load(weights, device="cpu").calibration and found.pairs == 20
+    found = Matcher.load(weights, device="cpu").calibration
+    assert found == parse_calibration(said["calibration"]) and found.pairs == 20
     with safe_open(weights, "pt") as file:
         assert len(file.metadata()["calibration"]) < 1000
 

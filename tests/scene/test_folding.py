@@ -13,7 +13,8 @@ from mmgsd.scene.state import write_state
 
 bpy = pytest.importorskip("bpy")
 
-from mmgsd.scene import cloth, manipulation  # noqa: E402
+from mmgsd.scene import manipulation  # noqa: E402
+from mmgsd.scene.objects import cloth  # noqa: E402
 
 NOWHERE = [((-40.0, -40.0), (200.0, 200.0))]
 STARTS = {

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from mmgsd.fold.tasks import TASKS
+from mmgsd.scene.objects.rope_relax import bend
+from mmgsd.scene.objects.rope_shape import LENGTH, sample_rope
 from mmgsd.scene.rope_pull import pull_rope
-from mmgsd.scene.rope_relax import bend
-from mmgsd.scene.rope_shape import LENGTH, sample_rope
 
 
 def measure_length(centre):

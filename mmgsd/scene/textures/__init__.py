@@ -1,0 +1,1 @@
+"""What the object and its surroundings look like: colours, shader nodes and printed images."""

@@ -1,0 +1,1 @@
+"""What is seen around the object in the scene "workspace": surfaces, distractors, light, and the view of them."""
