@@ -70,7 +70,7 @@ def check_images(paths: Paths, objects: Iterable[str], *, split: str = "test") -
 
 def check_training(paths: Paths, models: Iterable[TrainConfig], *, overwrite: bool = False) -> None:
     """ValueError where images are missing that ``models`` need: test images, and training images of what is trained."""
-    from mmgsd.learn.checkpoints import WEIGHTS  # with torch: not in every notebook that reads parameters
+    from mmgsd.model.tensors import WEIGHTS  # with torch: not in every notebook that reads parameters
 
     there = {model: (paths.model(model) / WEIGHTS).is_file() and not overwrite for model in models}
     check_images(paths, sorted({model.object for model in there}))

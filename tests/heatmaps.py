@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mmgsd.learn.network import compute_cell_centres
+from mmgsd.model.network import compute_cell_centres
 
 SIZE, CELLS = (485, 485), 64
 CELL_PX = SIZE[0] / CELLS

@@ -21,13 +21,14 @@ from mmgsd.dataset_format import TABLES
 from mmgsd.extras import packing, shipping
 from mmgsd.files import DamagedFileError
 from mmgsd.learn import training
-from mmgsd.learn.checkpoints import CHECKPOINT, WEIGHTS, describe_run
+from mmgsd.learn.checkpoints import CHECKPOINT
 from mmgsd.learn.training import train_model
 from mmgsd.match.match import Match
 from mmgsd.measure import matrix
 from mmgsd.measure.evaluation import evaluate_baseline, load_queries, write_results
 from mmgsd.measure.figure_data import FigureData, load_figure_data, save_figure_data
 from mmgsd.measure.metrics import ErrorSummary
+from mmgsd.model.tensors import WEIGHTS, describe_run
 from mmgsd.report import latex as report
 from mmgsd.report import tables
 

@@ -15,9 +15,9 @@ from mmgsd.config import OBJECTS, PRESETS, load_preset
 from mmgsd.dataset import Dataset, load_dataset, sample_pairs
 from mmgsd.experiments import SHIPPED, configure_study, get_label
 from mmgsd.images import decode_image, to_rgb
-from mmgsd.learn.checkpoints import WEIGHTS
 from mmgsd.match.baselines import BASELINES, BaselineMatcher
 from mmgsd.match.matcher import Matcher
+from mmgsd.model.tensors import WEIGHTS
 from mmgsd.parameters import find_file
 from mmgsd.paths import Paths, find_root, find_shipped
 

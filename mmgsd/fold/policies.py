@@ -15,10 +15,10 @@ from mmgsd.config import DEFAULT_GROUP, load_preset
 from mmgsd.experiments import configure_model, get_colour
 from mmgsd.fold.demonstration import Look
 from mmgsd.fold.moves import AGREE, BEST, JOINT
-from mmgsd.learn.checkpoints import WEIGHTS
 from mmgsd.match.baselines import BaselineMatcher
 from mmgsd.match.match import Match
 from mmgsd.match.matcher import Matcher, find_weights
+from mmgsd.model.tensors import WEIGHTS
 from mmgsd.paths import Paths, find_root
 from mmgsd.symmetry import load_group
 

@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from mmgsd.match.calibration import Calibration, Gaussian, Modes, compute_share
+from mmgsd.model.calibration import Calibration, Gaussian, Modes, compute_share
 from mmgsd.numerics import numpy_defaults
 
 RADIUS_PX = 20.0  # of a training image, within which a robot's grasp still holds, unless the caller says otherwise

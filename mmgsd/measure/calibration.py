@@ -21,8 +21,6 @@ from scipy.optimize import minimize, minimize_scalar
 from mmgsd.checks import read_count, read_flag
 from mmgsd.config import EvaluateConfig
 from mmgsd.dataset import Dataset, hold_out, join_datasets, load_dataset, load_parts, sample_pairs
-from mmgsd.learn.checkpoints import load_metadata, read_tensors, write_tensors
-from mmgsd.match.calibration import LEVELS, Calibration, Modes, compute_unit, parse_calibration
 from mmgsd.match.matcher import Matcher
 from mmgsd.measure.questions import ask, choose_points, describe, measure_mean_error, model_answer
 from mmgsd.measure.reading import choose_reading
@@ -35,6 +33,8 @@ from mmgsd.measure.uncertainty import (
     measure_modes,
     recalibrate,
 )
+from mmgsd.model.calibration import LEVELS, Calibration, Modes, compute_unit, parse_calibration
+from mmgsd.model.tensors import load_metadata, read_tensors, write_tensors
 from mmgsd.numerics import own_numerics
 
 BANDWIDTHS = (1 / 64, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2)  # of a contrastive heatmap, in margins

@@ -30,7 +30,6 @@ from mmgsd.experiments import (
     vary_sigma,
 )
 from mmgsd.files import DamagedFileError
-from mmgsd.learn.checkpoints import WEIGHTS, describe_run
 from mmgsd.learn.training import train_model
 from mmgsd.measure.evaluation import (
     BASELINES,
@@ -42,6 +41,7 @@ from mmgsd.measure.evaluation import (
     summarise,
     write_results,
 )
+from mmgsd.model.tensors import WEIGHTS, describe_run
 from mmgsd.parameters import read_scheduler
 from mmgsd.paths import Paths, find_root
 from mmgsd.progress import ProgressBar

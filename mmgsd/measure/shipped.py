@@ -35,10 +35,7 @@ from mmgsd.dataset import load_dataset
 from mmgsd.dataset_format import SPLITS
 from mmgsd.experiments import configure_study
 from mmgsd.files import read_json, write_json
-from mmgsd.learn.checkpoints import WEIGHTS
-from mmgsd.learn.training import name_hardware
 from mmgsd.match.baselines import BASELINES, BaselineMatcher, FeatureMatcher
-from mmgsd.match.calibration import Calibration
 from mmgsd.match.match import RADIUS_PX, Match
 from mmgsd.match.matcher import Matcher, find_weights
 from mmgsd.match.mixture import AS_IT_IS, Reading
@@ -56,6 +53,9 @@ from mmgsd.measure.uncertainty import (
     measure_modes,
     summarise_uncertainty,
 )
+from mmgsd.model.calibration import Calibration
+from mmgsd.model.network import name_hardware
+from mmgsd.model.tensors import WEIGHTS
 from mmgsd.paths import Paths, find_root
 
 STUDIES = ("robustness", "backbones")

@@ -15,7 +15,7 @@ from mmgsd.command import run_command
 from mmgsd.config import OBJECTS, load_preset
 from mmgsd.experiments import configure_model
 from mmgsd.files import write_json
-from mmgsd.learn.training import name_hardware
+from mmgsd.model.network import name_hardware
 from mmgsd.parameters import check_images
 from mmgsd.paths import Paths, find_root
 

@@ -23,11 +23,11 @@ from sklearn.mixture import GaussianMixture
 from mmgsd.command import run_command
 from mmgsd.config import ROUNDNESS, load_preset
 from mmgsd.dataset import load_dataset, sample_pairs
-from mmgsd.learn.checkpoints import WEIGHTS
-from mmgsd.learn.network import compute_cell_centres
 from mmgsd.match.matcher import Matcher, read_heatmap
 from mmgsd.match.mixture import PRIOR_WEIGHT
 from mmgsd.measure.metrics import compute_mode_errors
+from mmgsd.model.network import compute_cell_centres
+from mmgsd.model.tensors import WEIGHTS
 from mmgsd.parameters import check_images, check_made
 from mmgsd.paths import Paths, find_root
 

@@ -10,11 +10,13 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from mmgsd.config import DETAILED, NETWORKS
-from mmgsd.learn.network import (
+from mmgsd.model import network as networks
+from mmgsd.model.network import (
     ResNet34Trunk,
     build_network,
     compute_cell_centres,
     compute_input_size,
+    compute_squared_distances,
     fit_input_size,
     sample_descriptors,
 )
@@ -185,3 +187,40 @@ def test_descriptors_between_cells_are_bilinear() -> None:
     xy = torch.tensor([[[1.0, 1.5], [1.5, 1.5], [0.5, 2.0]]])
     # (1, 1.5): a quarter across, half down: 0.5 * (0.75 * 0 + 0.25 * 4) + 0.5 * (0.75 * 8 + 0.25 * 16) = 5.5
     torch.testing.assert_close(sample_descriptors(grid, xy, (4, 4)), torch.tensor([[[5.5], [7.0], [6.0]]]))
+
+
+@pytest.fixture
+def generator() -> torch.Generator:
+    return torch.Generator().manual_seed(0)
+
+
+def test_squared_distances_are_cdists(generator: torch.Generator) -> None:
+    source, target = (torch.randn(3, n, 8, generator=generator, dtype=torch.float64) for n in (5, 7))
+    torch.testing.assert_close(compute_squared_distances(source, target), torch.cdist(source, target) ** 2)
+
+
+def test_squared_distances_are_never_negative(generator: torch.Generator) -> None:
+    same = 100 + torch.randn(1, 50, 16, generator=generator)
+    assert compute_squared_distances(same, same).min() >= 0
+
+
+def test_squared_distances_gradient(generator: torch.Generator) -> None:
+    source, target = (
+        torch.randn(2, n, 3, generator=generator, dtype=torch.float64, requires_grad=True) for n in (3, 4)
+    )
+    assert torch.autograd.gradcheck(compute_squared_distances, (source, target))
+
+
+@pytest.mark.parametrize("name", ["source", "target"])
+def test_descriptors_of_another_shape(name: str) -> None:
+    good, bad = torch.zeros(1, 2, 3), torch.zeros(2, 3)
+    arguments = (bad, good) if name == "source" else (good, bad)
+    with pytest.raises(ValueError, match=rf"{name} must have shape \(K, n, D\), got \(2, 3\)"):
+        compute_squared_distances(*arguments)
+
+
+@pytest.mark.parametrize(("threads", "said"), [(8, "CPU, 8 cores"), (1, "CPU, 1 of 8 cores")])
+def test_the_hardware_is_what_was_used_of_it(monkeypatch: pytest.MonkeyPatch, threads: int, said: str) -> None:
+    monkeypatch.setattr(networks.os, "cpu_count", lambda: 8)
+    monkeypatch.setattr(networks.torch, "get_num_threads", lambda: threads)
+    assert networks.name_hardware(torch.device("cpu")) == said

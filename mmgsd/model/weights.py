@@ -13,8 +13,8 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from mmgsd.config import TrainConfig, from_dict
-from mmgsd.learn.network import build_network
-from mmgsd.match.calibration import parse_calibration
+from mmgsd.model.calibration import parse_calibration
+from mmgsd.model.network import build_network
 
 FORMAT = "mmgsd-1"
 PICKLES = (b"PK\x03\x04", b"\x80")  # how PyTorch's own files begin

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from mmgsd.learn.heads import Heads, compute_judge_loss, compute_mask_loss, compute_present_loss, look_up
-from mmgsd.learn.network import build_network
+from mmgsd.model.heads import Heads, compute_judge_loss, compute_mask_loss, compute_present_loss, look_up
+from mmgsd.model.network import build_network
 
 
 @pytest.mark.parametrize(("name", "stride", "mask_stride"), [("lite0", 4, 4), ("lite0x2", 4, 4), ("lite0x2fine", 8, 2)])

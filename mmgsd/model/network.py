@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -14,8 +15,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from mmgsd.config import DETAILED, FROZEN, NETWORKS, PASSES
-from mmgsd.learn import dinov2
-from mmgsd.learn.heads import Heads, Outputs
+from mmgsd.model import dinov2
+from mmgsd.model.heads import Heads, Outputs
 from mmgsd.numerics import float32_layers
 
 QUIET = 0.1  # scale of what a pass adds that is put onto trained ones: their answers hardly change at first
@@ -27,7 +28,7 @@ TAPS = {2: 24, 4: 40, 10: 112, 15: 320}  # EfficientNet-Lite0: block after which
 class PyramidNetwork(nn.Module):
     """A trunk with a feature pyramid; (B, 3, H, W) in [0, 1] to (B, roles * D, H / 4, W / 4).
 
-    The trunk is EfficientNet-Lite0, or with ``frozen`` DINOv2's ViT-S/14 as it is (`mmgsd.learn.dinov2`), which is no
+    The trunk is EfficientNet-Lite0, or with ``frozen`` DINOv2's ViT-S/14 as it is (`mmgsd.model.dinov2`), which is no
     part of the module: each level of the pyramid is then the same three blocks' features, resized. A patch of it is 16
     px of the image.
 
@@ -347,6 +348,14 @@ def sample_descriptors(descriptors: Tensor, xy: Tensor, size: tuple[int, int]) -
     return sampled[:, :, 0].mT  # (B, P, D)
 
 
+def compute_squared_distances(source: Tensor, target: Tensor) -> Tensor:
+    """Squared Euclidean distances of (K, Q, D) and (K, C, D) descriptors as (K, Q, C), never negative."""
+    _check_descriptors("source", source)
+    _check_descriptors("target", target)
+    norms = source.square().sum(-1)[..., :, None] + target.square().sum(-1)[..., None, :]
+    return torch.baddbmm(norms, source, target.mT, alpha=-2).clamp(min=0)
+
+
 def find_device(device: str = "") -> str:
     """The ``device``, or of "" ``cuda`` where torch finds one, else ``cpu``; ValueError for one that is not here."""
     device = device or ("cuda" if torch.cuda.is_available() else "cpu")
@@ -358,6 +367,14 @@ def find_device(device: str = "") -> str:
     return device
 
 
+def name_hardware(device: torch.device) -> str:
+    """What results say they were made on."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    threads, cores = torch.get_num_threads(), os.cpu_count()
+    return f"CPU, {cores} cores" if threads >= cores else f"CPU, {threads} of {cores} cores"
+
+
 def _make_stage(inputs: int, outputs: int, blocks: int, *, stride: int = 1, dilation: int = 1) -> nn.Sequential:
     first = BasicBlock(inputs, outputs, stride, dilation)
     return nn.Sequential(first, *(BasicBlock(outputs, outputs, 1, dilation) for _ in range(blocks - 1)))
@@ -366,6 +383,11 @@ def _make_stage(inputs: int, outputs: int, blocks: int, *, stride: int = 1, dila
 def _conv_block(inputs: int, outputs: int, *, stride: int = 1) -> nn.Sequential:
     convolution = nn.Conv2d(inputs, outputs, 3, stride, padding=1, bias=False)
     return nn.Sequential(convolution, nn.BatchNorm2d(outputs), nn.ReLU(inplace=True))
+
+
+def _check_descriptors(name: str, value: Tensor) -> None:
+    if value.ndim != 3:
+        raise ValueError(f"{name} must have shape (K, n, D), got {tuple(value.shape)}")
 
 
 def _resize(x: Tensor, like: Tensor) -> Tensor:

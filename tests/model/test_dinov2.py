@@ -9,9 +9,9 @@ import torch
 
 from mmgsd.config import TrainConfig
 from mmgsd.extras.backbones import MODEL, convert_backbone
-from mmgsd.learn import dinov2
-from mmgsd.learn.network import build_network
 from mmgsd.learn.optimiser import make_optimisers
+from mmgsd.model import dinov2
+from mmgsd.model.network import build_network
 
 # Of the input below, by ONNX Runtime from the published file: four channels of the last block's patches.
 PUBLISHED = {

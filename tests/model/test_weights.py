@@ -14,8 +14,8 @@ from heatmaps import SIZE
 from safetensors.torch import save_file
 
 from mmgsd.config import TrainConfig
-from mmgsd.learn.network import build_network
 from mmgsd.match.matcher import Matcher, load
+from mmgsd.model.network import build_network
 from mmgsd.paths import find_root
 
 CONFIG = TrainConfig(input_px=64, descriptor_dim=8)

@@ -12,10 +12,10 @@ import torch
 from heatmaps import CELLS, CORNERS, SIZE, draw_mixture
 
 from mmgsd.dataset import load_dataset
-from mmgsd.learn.network import compute_cell_centres
-from mmgsd.match.calibration import LEVELS, Calibration, Gaussian, Modes, parse_calibration
 from mmgsd.match.match import Match
 from mmgsd.match.matcher import load, make_match
+from mmgsd.model.calibration import LEVELS, Calibration, Gaussian, Modes, parse_calibration
+from mmgsd.model.network import compute_cell_centres
 from mmgsd.paths import find_root
 
 TABLE = tuple(float(level / (1 - level)) for level in LEVELS)
