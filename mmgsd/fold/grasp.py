@@ -19,14 +19,14 @@ import numpy as np
 from mmgsd.command import run_command
 from mmgsd.config import DEFAULT_GROUP
 from mmgsd.files import write_json
+from mmgsd.fold.jobs import act_job, read_state, run_jobs
 from mmgsd.fold.measures import SIDES_M, estimate_mean, estimate_share
 from mmgsd.fold.rollouts import ROLLOUTS, Bench, Rollout, find_on_table
+from mmgsd.fold.state import State
 from mmgsd.fold.tasks import GRASP, GROUNDS
 from mmgsd.match.match import Match
 from mmgsd.match.matcher import Matcher, load
 from mmgsd.paths import Paths, find_root
-from mmgsd.scene.folding import act_job, read_state, run_jobs
-from mmgsd.scene.state import State
 from mmgsd.symmetry import load_group
 
 MATCHERS = {"mmgsd": "cloth", "mmgsd_paper": "cloth-paper", "spcl": "cloth-spcl"}  # shipped weights that answer

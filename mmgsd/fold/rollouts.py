@@ -26,15 +26,15 @@ from mmgsd.figures.style import save_figure
 from mmgsd.files import DamagedFileError, read_json, set_aside, write_json
 from mmgsd.fold.agreement import Motion
 from mmgsd.fold.demonstration import Demonstration, Look, write_demonstration
+from mmgsd.fold.jobs import act_job, demonstration_job, look_job, run_jobs, start_job, true_moves
 from mmgsd.fold.measures import SIDES_M, SUCCESS, compare_rollouts, estimate_mean, estimate_share, measure_outcome
 from mmgsd.fold.moves import Answer, choose_moves
 from mmgsd.fold.policies import POLICIES, SHIPPED, TRAINED_BY, Policy, ask, digest_policy, draw_moves
+from mmgsd.fold.state import State, read_state
 from mmgsd.fold.tasks import GROUNDS, TASKS, Task, find_task
 from mmgsd.match.camera import compute_rays
 from mmgsd.paths import Paths, find_root
 from mmgsd.progress import ProgressBar
-from mmgsd.scene.folding import act_job, demonstration_job, look_job, run_jobs, start_job, true_moves
-from mmgsd.scene.state import State, read_state
 from mmgsd.symmetry import load_group
 
 ROLLOUTS = {"smoke": 2, "quick": 36, "paper": 100}  # of each policy and object

@@ -12,9 +12,9 @@ from test_rollouts import FLAT, MATRIX, POSE
 
 from mmgsd.fold import grasp, rollouts
 from mmgsd.fold.grasp import choose_picks, find_middle, judge_grasp, list_grasps, run_grasps, summarise_grasps
+from mmgsd.fold.state import State, read_state, write_state
 from mmgsd.fold.tasks import GROUNDS, STARTS
 from mmgsd.match.match import Match
-from mmgsd.scene.state import State, read_state, write_state
 
 ABOUT = {"object": "cloth", "task": "grasp", "start": "flat", "ground": "plain", "seed": 0, "fault": "", "look": 0,
          "mark": "", "thickness": 0.0}  # fmt: skip

@@ -14,9 +14,9 @@ from mmgsd.fold.demonstration import Look, read_demonstration
 from mmgsd.fold.moves import Answer
 from mmgsd.fold.policies import POLICIES, SHIPPED, digest_policy, find_answering
 from mmgsd.fold.rollouts import choose_shown, find_on_table, list_rollouts, run_folding, summarise_rollouts
+from mmgsd.fold.state import State, read_state, write_state
 from mmgsd.fold.tasks import GROUNDS, TASKS
 from mmgsd.report.results import load_results
-from mmgsd.scene.state import State, read_state, write_state
 
 ASKED = [POLICIES["truth"], POLICIES["random"]]
 ROW, COLUMN = np.divmod(np.arange(625), 25)

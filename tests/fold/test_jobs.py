@@ -7,13 +7,14 @@ import pytest
 from scipy.ndimage import distance_transform_edt
 
 from mmgsd.files import DamagedFileError
+from mmgsd.fold.jobs import act_job, demonstration_job, look_job, read_state, run_jobs, start_job, true_moves
+from mmgsd.fold.state import write_state
 from mmgsd.fold.tasks import TASKS
-from mmgsd.scene.folding import act_job, demonstration_job, look_job, read_state, run_jobs, start_job, true_moves
-from mmgsd.scene.state import write_state
 
 bpy = pytest.importorskip("bpy")
 
-from mmgsd.scene import cloth, manipulation  # noqa: E402
+from mmgsd.fold import manipulation  # noqa: E402
+from mmgsd.scene import cloth  # noqa: E402
 
 NOWHERE = [((-40.0, -40.0), (200.0, 200.0))]
 STARTS = {

@@ -19,10 +19,10 @@ from dask.distributed import Client
 from mmgsd.checks import check, check_choice, read_count, read_flag
 from mmgsd.cluster import wait_for_each
 from mmgsd.files import DamagedFileError, scratch_folder, set_aside, write_bytes
+from mmgsd.fold.state import State, read_state
 from mmgsd.fold.tasks import GROUNDS, STARTS, Move, Task, find_task, place_truth
 from mmgsd.progress import ProgressBar
 from mmgsd.scene.rendering import RenderError, connect, explain, run_child
-from mmgsd.scene.state import State, read_state
 
 __all__ = ["State", "act_job", "demonstration_job", "look_job", "read_state", "run_jobs", "start_job", "true_moves"]
 
@@ -157,7 +157,7 @@ def _make_batch(jobs: dict[str, tuple[dict, bytes]]) -> dict[str, bytes]:
         for i, (job, before) in enumerate(jobs.values()):
             state = write_bytes(folder / f"before{i}.npz", before) if before else ""
             states.append(job | {"state": str(state), "out": str(folder / f"after{i}.npz")})
-        code, said = run_child({"states": states, "parent": os.getpid()}, folder)
+        code, said = run_child({"states": states, "parent": os.getpid()}, folder, module="mmgsd.fold")
         if code:
             raise RenderError(f"folding {', '.join(jobs)} {explain(code)}:\n{said[-2000:]}")
         return {name: Path(one["out"]).read_bytes() for name, one in zip(jobs, states, strict=True)}

@@ -21,6 +21,7 @@ from mathutils.bvhtree import BVHTree
 from scipy.ndimage import binary_dilation
 
 from mmgsd.config import IMAGE_SIZE
+from mmgsd.fold.state import State, read_state, write_state
 from mmgsd.fold.tasks import Task, find_task
 from mmgsd.scene import cloth, randomize, render, rope
 from mmgsd.scene.episode import add_floor
@@ -30,7 +31,6 @@ from mmgsd.scene.meshes import SPACING
 from mmgsd.scene.render import Camera, DeformedObject
 from mmgsd.scene.rope_pull import pull_rope
 from mmgsd.scene.rope_shape import LENGTH, OwnPart, RopeShape, sample_rope
-from mmgsd.scene.state import State, read_state, write_state
 from mmgsd.scene.things import add_things
 from mmgsd.scene.workspace import draw_light, find_seen, frame_points
 
@@ -53,7 +53,7 @@ Moves = Sequence[tuple[Sequence[float], Sequence[float]]]  # pick (x, y) and pla
 
 
 def run_job(job: dict[str, Any], out: Path) -> Path:
-    """Make the state of a job of `mmgsd.scene.folding` and write it to ``out``; ValueError for an unknown task."""
+    """Make the state of a job of `mmgsd.fold.jobs` and write it to ``out``; ValueError for an unknown task."""
     if job["kind"] == "act":
         return write_state(out, act(read_state(job["state"]), job["moves"], job["mark"]))
     if job["kind"] == "look":
