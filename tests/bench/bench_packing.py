@@ -12,12 +12,12 @@ import numpy as np
 
 from mmgsd.command import run_command
 from mmgsd.config import OBJECTS, EvaluateConfig, load_preset
-from mmgsd.experiments import configure_model
 from mmgsd.extras.packing import unpack_dataset
 from mmgsd.measure.evaluation import evaluate_model, load_queries
 from mmgsd.model.tensors import WEIGHTS
-from mmgsd.parameters import check_images, check_made
 from mmgsd.paths import Paths, find_root
+from mmgsd.studies.models import configure_model
+from mmgsd.studies.parameters import check_images, check_made
 
 QUESTIONS = EvaluateConfig(pairs=100, points=125)
 

@@ -13,11 +13,12 @@ import pytest
 from test_heads_measured import write_weights
 
 from mmgsd.config import EvaluateConfig, load_preset
-from mmgsd.experiments import configure_study
 from mmgsd.match.matcher import Matcher
 from mmgsd.measure import shipped
-from mmgsd.measure.shipped import Masked, main, measure_baseline, measure_read, measure_study, measure_weights
+from mmgsd.measure.shipped import Masked, main, measure_baseline, measure_read, measure_weights
 from mmgsd.paths import Paths
+from mmgsd.studies.models import configure_study
+from mmgsd.studies.shipped import measure_study
 
 SAMPLE = Path(__file__).parents[2] / "data" / "sample"
 
@@ -85,7 +86,7 @@ def test_a_baseline_is_told_where_the_object_is_seen() -> None:
 
 def test_a_study_that_is_not_trained_says_how_to_train_it(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", [sys.executable, "robustness"])
-    with pytest.raises(FileNotFoundError, match="run python -m mmgsd.measure.matrix paper --study robustness"):
+    with pytest.raises(FileNotFoundError, match="run python -m mmgsd.studies.matrix paper --study robustness"):
         main()
     monkeypatch.setattr(shipped, "load_preset", load_preset)
     monkeypatch.setattr(sys, "argv", [sys.executable, "robustness", "--preset", "quick", "--steps", "7"])
