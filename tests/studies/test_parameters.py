@@ -33,7 +33,7 @@ from mmgsd.studies.parameters import (
     whole,
 )
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 CHECKED = [path for path in NOTEBOOKS if "read_parameters(globals()" in path.read_text()]
 PRESETS = "'smoke', 'quick', 'paper'"
