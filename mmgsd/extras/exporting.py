@@ -15,8 +15,8 @@ import torch
 from torch import Tensor, nn
 
 from mmgsd.files import writing
-from mmgsd.learn.network import compute_input_size
 from mmgsd.match.matcher import Matcher
+from mmgsd.model.network import compute_input_size
 from mmgsd.numerics import own_numerics
 
 TOLERANCE = 1e-3  # of an output, relative to its largest value

@@ -15,14 +15,15 @@ import torch
 
 from mmgsd.command import run_command
 from mmgsd.config import OBJECTS, TrainConfig, load_preset
-from mmgsd.experiments import SHIPPED, configure_model
 from mmgsd.files import DamagedFileError, ForeignFileError, locked, set_aside, write_bytes, write_text
-from mmgsd.learn.checkpoints import WEIGHTS, load_metadata, read_config, read_tensors, write_tensors
 from mmgsd.measure.calibration import calibrate_weights
 from mmgsd.measure.evaluation import read_results
-from mmgsd.measure.shipped import RESULTS, SETS
-from mmgsd.parameters import check_stored
+from mmgsd.measure.shipped import SETS
+from mmgsd.model.tensors import WEIGHTS, load_metadata, read_config, read_tensors, write_tensors
 from mmgsd.paths import Paths, find_root
+from mmgsd.studies.models import SHIPPED, configure_model
+from mmgsd.studies.parameters import check_stored
+from mmgsd.studies.shipped import RESULTS
 
 CARD = """# {title}
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from textwrap import fill
-from typing import Any
 
 import cv2
 import numpy as np
@@ -13,8 +12,7 @@ from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 from PIL import Image
 
-from mmgsd.config import OBJECTS
-from mmgsd.figures.style import MARK, PAGE_IN, check_filled, finish_axes, make_grid, mark_pixel, styled
+from mmgsd.figures.style import MARK, PAGE_IN, check_filled, make_grid, mark_pixel, styled
 from mmgsd.files import writing
 
 THUMBNAIL_PX, FRAME_PX = 160, 5  # sides of a picture, and of the frame that says whether it is a success
@@ -41,33 +39,6 @@ def plot_moves(pictures: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
             mark_pixel(axis, *pick)
         axis.set_title(title)
     return figure
-
-
-@styled
-def plot_success(results: Mapping[str, Any]) -> Figure:
-    """A panel for each object: how often each policy succeeds in the rollouts that count, with 95 % intervals.
-
-    ``results`` as `mmgsd.fold.rollouts` stores them; a policy that was not measured has no dot. ValueError of none.
-    """
-    from mmgsd.fold.policies import POLICIES  # needs more than drawing moves does
-
-    rows = results["policies"]
-    names = [name for name in POLICIES if any("reachable" in rows[object].get(name, {}) for object in OBJECTS)]
-    check_filled("results", names)
-    size = PAGE_IN, 0.7 + 0.2 * len(names)
-    figure, axes = plt.subplots(1, len(OBJECTS), figsize=size, layout="constrained", sharey=True)
-    for axis, object in zip(axes, OBJECTS, strict=True):
-        for place, name in enumerate(names):
-            said = rows[object].get(name, {}).get("reachable", {}).get("success")
-            if said:
-                mean, low, high = (100 * said[key] for key in ("mean", "low", "high"))
-                axis.errorbar(mean, place, xerr=[[mean - low], [high - mean]], fmt="o", ms=4, capsize=2,
-                              color=POLICIES[name].colour)  # fmt: skip
-        counted = rows[object].get("truth", {}).get("reachable", {}).get("success", {}).get("count", 0)
-        axis.set(title=f"{object.capitalize()}, {counted} rollouts", xlabel="Success (%)", xlim=(-4, 104))
-    axes[0].set_yticks(range(len(names)), [POLICIES[name].label.replace("`", "") for name in names])
-    axes[0].invert_yaxis()
-    return finish_axes(figure)
 
 
 @styled

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from mmgsd.figures.plots import shrink_match
 from mmgsd.figures.style import PAGE_IN, check_filled, make_grid, mark_true, show_answer, show_source, styled
-from mmgsd.match.match import Match
-from mmgsd.measure.photographs import Photograph
+
+if TYPE_CHECKING:
+    from mmgsd.match.match import Match
+    from mmgsd.measure.photographs import Photograph
 
 COLUMNS = 6  # three photographs a row, each beside what it was asked from
 MOST = 60  # photographs on one sheet

@@ -1,13 +1,13 @@
-"""What the figures share: style, lines of the methods, panels that show images, and saving.
+"""What the figures share: style, panels that show images, and saving.
 
-Sizes are those of a two-column paper (3.5 and 7.1 in), colours those of Okabe and Ito, which colour-blind readers tell
-apart; one method has one colour in every figure (`mmgsd.experiments`).
+Sizes are those of a two-column paper (3.5 and 7.1 in).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import matplotlib
@@ -19,14 +19,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
-from mmgsd.config import N_POINTS
-from mmgsd.experiments import get_colour, get_label
 from mmgsd.files import writing
-from mmgsd.match.describe import find_hidden, say_presence
-from mmgsd.match.match import Match
 
-CHANCE_STYLES = {"centre": "--", "random": ":"}
-ABOVE = {"unimodal": (0, (4, 2)), "pcl": (0, (4, 2))}  # dashed, on the lines that they lie on: MMGSD's, SPCL's
+if TYPE_CHECKING:
+    from mmgsd.match.match import Match
+
 COLUMN_IN, PAGE_IN = 3.5, 7.1  # widths of a column and of a page
 MARK = "#FFE100"  # the asked pixel
 TRUE = "#00FF6A"  # the sign of true matches
@@ -60,7 +57,7 @@ def save_figure(figure: Figure, path: Path, kinds: Sequence[str] = ("pdf", "png"
     return written
 
 
-def compute_point_colours(object: str, count: int = N_POINTS) -> np.ndarray:
+def compute_point_colours(object: str, count: int) -> np.ndarray:
     """(count, 3) colours: mixed from those of a square cloth's four corners, else in the order of the points."""
     if object != "cloth":
         return colormaps["turbo"](np.linspace(0.05, 0.95, count))[:, :3]
@@ -89,9 +86,9 @@ def show_answer(axis: Axes, match: Match, index: int, *, modes: bool = True) -> 
 def draw_modes(axis: Axes, match: Match, index: int) -> None:
     """Rings at the modes of one query, their area the weight, and the 1-std ellipses; of hidden ones dashed.
 
-    Faint where the query has no answer (`say_presence`), and where a mode has next to no weight.
+    Faint where the query has no answer (`Match.say_presence`), and where a mode has next to no weight.
     """
-    opacity, hidden = FAINT if say_presence(match, index) else 1.0, find_hidden(match, index)
+    opacity, hidden = FAINT if match.say_presence(index) else 1.0, match.find_hidden(index)
     for k in np.flatnonzero(np.isfinite(match.modes[index]).all(-1)):
         radii, angle = compute_ellipse(match.covariances[index, k])
         alpha = opacity * min(1.0, match.weights[index, k] / OPAQUE)
@@ -139,13 +136,6 @@ def fade_image(image: np.ndarray) -> np.ndarray:
     low, high = np.percentile(grey[::3, ::3], (1, 99))
     faded = 0.15 + 0.7 * np.clip((grey - low) / max(high - low, 1), 0, 1)
     return np.repeat(faded[..., None].astype(np.float32), 3, axis=-1)
-
-
-def get_line_style(method: str) -> dict:
-    """Label, colour and stroke of a method's line; chance is broken, MMGSD on top."""
-    style = {"label": get_label(method, short=True), "color": get_colour(method)}
-    order = 5 if method in ABOVE else 4 if method == "mmgsd" else 2
-    return style | {"linestyle": (CHANCE_STYLES | ABOVE).get(method, "-"), "zorder": order}
 
 
 def make_grid(aspects: Sequence[float], columns: int, width: float) -> tuple[Figure, np.ndarray]:

@@ -17,7 +17,7 @@ from torch import Tensor
 from mmgsd.config import TrainConfig
 from mmgsd.dataset import Dataset
 from mmgsd.learn.compositing import composite, disturb
-from mmgsd.learn.network import compute_input_size
+from mmgsd.model.network import compute_input_size
 
 CACHE_SCALE = 1.25  # images are kept in memory at this multiple of the network's input size
 WAVES = 4  # that bend an image

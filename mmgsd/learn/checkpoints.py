@@ -1,4 +1,4 @@
-"""What a training leaves in its folder: weights, checkpoint and log, whole or not at all, and for one run at a time."""
+"""What a training leaves in its folder: weights, checkpoint and log, for one run at a time."""
 
 from __future__ import annotations
 
@@ -11,17 +11,14 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from torch import Tensor
 
-from mmgsd.config import TrainConfig, from_dict
 from mmgsd.dataset import Dataset, join_datasets, load_parts
-from mmgsd.files import DamagedFileError, LockedError, locked, remove_leftovers, write_bytes
+from mmgsd.files import DamagedFileError, LockedError, locked, remove_leftovers
 from mmgsd.learn.distributed import Team
+from mmgsd.model.tensors import WEIGHTS, load_metadata, read_tensors, write_tensors
 
-WEIGHTS, CHECKPOINT, LOG = "weights.safetensors", "checkpoint.safetensors", "log.csv"
-REMEDY = "train it again (overwrite=True), or restore it where it was shipped"
+CHECKPOINT, LOG = "checkpoint.safetensors", "log.csv"
 
 
 def is_trained(weights: Path, dataset: Path, *, also: str = "") -> bool:
@@ -63,56 +60,6 @@ def check_enough(data: Dataset, held_out: Dataset) -> None:
             f"{data.folder} must hold at least 2 training images of each simulation, or 30 simulations of one view "
             f"each, so that 2 can be held out: got {len(data)} images of {len(np.unique(data.episode))} simulations"
         )
-
-
-def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> Path:
-    """Write a safetensors file whole or not at all; OSError names the path where the disk is full."""
-    return write_bytes(path, save({name: value.contiguous() for name, value in tensors.items()}, dict(metadata)))
-
-
-def read_tensors(path: Path | str, device: str = "cpu") -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Tensors and note of a safetensors file; DamagedFileError, which names it, where it is damaged or none."""
-    try:
-        with safe_open(path, "pt", device=device) as file:
-            return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
-    except FileNotFoundError:
-        raise
-    except (SafetensorError, OSError) as error:
-        raise DamagedFileError(f"{path} is truncated or no safetensors file ({error}): {REMEDY}") from error
-
-
-def load_metadata(weights: Path | str) -> dict[str, str]:
-    """What a weights file says of itself: ``config``, ``seconds`` of training, ``hardware``, ``images``, …
-
-    FileNotFoundError where there is none, DamagedFileError where it is damaged.
-    """
-    try:
-        with safe_open(weights, "pt") as file:
-            return file.metadata() or {}
-    except FileNotFoundError:
-        raise
-    except (SafetensorError, OSError) as error:
-        raise DamagedFileError(f"{weights} is truncated or no safetensors file ({error}): {REMEDY}") from error
-
-
-def read_config(weights: Path | str) -> tuple[TrainConfig, dict[str, str]]:
-    """The configuration that weights were trained with, and all that they say; DamagedFileError if they say none."""
-    note = load_metadata(weights)
-    try:
-        return from_dict(TrainConfig, json.loads(note["config"])), note
-    except (KeyError, ValueError, TypeError, AttributeError) as error:
-        raise DamagedFileError(f"{weights} names no configuration known here ({error}): {REMEDY}") from error
-
-
-def describe_run(weights: Path | str) -> dict[str, int | float | str]:
-    """Which model it is and what it cost: its name, steps, minutes, training images, seed, hardware."""
-    config, note = read_config(weights)
-    try:
-        minutes, images, hardware = round(float(note["seconds"]) / 60, 2), int(note["images"]), note["hardware"]
-    except (KeyError, ValueError) as error:
-        raise DamagedFileError(f"{weights} does not say what it cost ({error}): {REMEDY}") from error
-    run = {"model": config.name, "steps": config.steps, "minutes": minutes, "images": images}
-    return {**run, "seed": config.seed, "hardware": hardware}
 
 
 def write_checkpoint(path: Path, tensors: Mapping[str, Tensor], config: str, numbers: dict[str, Any]) -> Path:

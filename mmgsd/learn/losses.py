@@ -12,14 +12,6 @@ import torch
 from torch import Tensor
 
 
-def compute_squared_distances(source: Tensor, target: Tensor) -> Tensor:
-    """Squared Euclidean distances of (K, Q, D) and (K, C, D) descriptors as (K, Q, C), never negative."""
-    _check_descriptors("source", source)
-    _check_descriptors("target", target)
-    norms = source.square().sum(-1)[..., :, None] + target.square().sum(-1)[..., None, :]
-    return torch.baddbmm(norms, source, target.mT, alpha=-2).clamp(min=0)
-
-
 def compute_target(modes: Tensor, valid: Tensor, xs: Tensor, ys: Tensor, sigma_px: float) -> Tensor:
     """The n-modal isotropic Gaussian mixture on a grid of cells (paper section "Symmetric Distributional Loss").
 
@@ -88,11 +80,6 @@ def _integrate_hats(mean: Tensor, centres: Tensor, sigma: float) -> Tensor:
 
     hat = (width - offset.abs()).clamp(min=0)
     return (hat + tail(offset + width) - 2 * tail(offset) + tail(offset - width)).clamp(min=0) / width
-
-
-def _check_descriptors(name: str, value: Tensor) -> None:
-    if value.ndim != 3:
-        raise ValueError(f"{name} must have shape (K, n, D), got {tuple(value.shape)}")
 
 
 def _check_same_shape(first: Tensor, second: Tensor) -> None:

@@ -9,7 +9,7 @@ from torch.nn import functional as F
 from mmgsd.config import CONTRASTIVE, TrainConfig
 from mmgsd.learn import losses
 from mmgsd.learn.augmentation import Batch
-from mmgsd.learn.heads import (
+from mmgsd.model.heads import (
     ELSEWHERE,
     JITTER_PX,
     SHARES,
@@ -19,7 +19,7 @@ from mmgsd.learn.heads import (
     compute_mask_loss,
     compute_present_loss,
 )
-from mmgsd.learn.network import compute_cell_centres, sample_descriptors
+from mmgsd.model.network import compute_cell_centres, compute_squared_distances, sample_descriptors
 
 JUDGED = 24  # source points of each image that are judged in another
 
@@ -60,7 +60,7 @@ def compute_loss(
         return function((match + 1e-12).sqrt(), valid, (far + 1e-12).sqrt(), apart, margin=config.margin)
     xs, ys = (c.to(descriptors.device) for c in compute_cell_centres(size, descriptors.shape[-2:]))
     wanted = losses.compute_target(modes, valid, xs, ys, compute_sigma(config, step))
-    squared = losses.compute_squared_distances(source, target[pair[1]].flatten(2).mT)
+    squared = compute_squared_distances(source, target[pair[1]].flatten(2).mT)
     return losses.mmgsd(squared, wanted)
 
 

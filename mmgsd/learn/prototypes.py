@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mmgsd.learn.losses import compute_squared_distances
+from mmgsd.model.network import compute_squared_distances
 
 IMAGES = 100  # images that the initial prototypes are computed from
 SPREAD = 24.0  # mean squared distance of two initial prototypes: exp(-24) is no match

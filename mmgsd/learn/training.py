@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import os
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -27,22 +26,21 @@ from mmgsd.learn.augmentation import Batch, load_training_images, make_batch
 from mmgsd.learn.checkpoints import (
     CHECKPOINT,
     LOG,
-    WEIGHTS,
     check_enough,
     held,
     is_trained,
     read_checkpoint,
     remove_run,
     write_checkpoint,
-    write_tensors,
 )
-from mmgsd.learn.network import build_network, find_device, sample_descriptors
 from mmgsd.learn.objective import compute_head_loss, compute_loss
 from mmgsd.learn.optimiser import make_optimisers
 from mmgsd.learn.prototypes import compute_prototype_loss, make_prototypes
 from mmgsd.match.matcher import Matcher, load
 from mmgsd.measure.calibration import calibrate_bandwidth, calibrate_modes, calibrate_temperature
 from mmgsd.measure.questions import measure_rmse
+from mmgsd.model.network import build_network, find_device, name_hardware, sample_descriptors
+from mmgsd.model.tensors import WEIGHTS, write_tensors
 from mmgsd.numerics import own_numerics
 from mmgsd.progress import ProgressBar
 
@@ -329,14 +327,6 @@ def _make_network(config: TrainConfig, models: Path) -> torch.nn.Module:
                 raise ValueError(f"trunk_weights {start!r} has {name} {theirs!r}, the training {ours!r}")
         network.start_from(trained.network)
     return network
-
-
-def name_hardware(device: torch.device) -> str:
-    """What results say they were made on."""
-    if device.type == "cuda":
-        return torch.cuda.get_device_name(device)
-    threads, cores = torch.get_num_threads(), os.cpu_count()
-    return f"CPU, {cores} cores" if threads >= cores else f"CPU, {threads} of {cores} cores"
 
 
 def _cosine(progress: float) -> float:

@@ -6,17 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from mmgsd.match.match import Match
-
-LIKELY = 0.5  # from here on something is said to be so
+from mmgsd.match.match import LIKELY, Match
 
 
 def describe_answer(match: Match) -> list[dict[str, Any]]:
     """A `Match` as plain values, a dictionary a query: px, shares, nats.
 
     ``visible`` of a mode, ``on_object``, ``absent`` and ``said``, which is "" or why there is no answer
-    (`say_presence`), only where they are known. Of a joint answer each mode has its ``answer``, from 1 on: those of one
-    number belong together.
+    (`Match.say_presence`), only where they are known. Of a joint answer each mode has its ``answer``, from 1 on: those
+    of one number belong together.
     """
     confidence, described = match.confidence(), []
     for query, xy in enumerate(match.xy):
@@ -24,7 +22,7 @@ def describe_answer(match: Match) -> list[dict[str, Any]]:
         names = [name for name in ("entropy", "outside", "on_object", "absent") if getattr(match, name) is not None]
         scalars = {name: round(float(getattr(match, name)[query]), 4) for name in names}
         if "on_object" in scalars or "absent" in scalars:
-            scalars["said"] = say_presence(match, query)
+            scalars["said"] = match.say_presence(query)
         described.append({"xy": xy.astype(float).round(2).tolist(), "modes": modes, **scalars})
     return described
 
@@ -39,22 +37,6 @@ def _describe_mode(match: Match, query: int, k: int, confidence: np.ndarray) -> 
     if match.joint is not None:
         mode["answer"] = int(k) + 1
     return mode if match.visible is None else {**mode, "visible": round(float(match.visible[query, k]), 4)}
-
-
-def say_presence(match: Match, query: int = 0) -> str:
-    """Why a query has no answer: the object is absent from image1, or the pixel is background; "" where it has one."""
-    if match.absent is not None and match.absent[query] > LIKELY:
-        return f"absent: image1 does not show the object ({match.absent[query]:.0%} sure)"
-    if match.on_object is not None and match.on_object[query] < LIKELY:
-        return f"background: the pixel is not on the object ({1 - match.on_object[query]:.0%} sure)"
-    return ""
-
-
-def find_hidden(match: Match, query: int = 0) -> np.ndarray:
-    """(n,) bool, which modes' matches are likely there but hidden by something, as far as that is known."""
-    if match.visible is None:
-        return np.zeros(match.modes.shape[1], bool)
-    return match.visible[query] < LIKELY
 
 
 def format_query(query: dict[str, Any]) -> str:

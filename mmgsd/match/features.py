@@ -12,8 +12,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from mmgsd.learn import dinov2
-from mmgsd.learn.network import IMAGENET_MEAN, IMAGENET_STD, build_trunk, compute_taps, sample_descriptors
+from mmgsd.model import dinov2
+from mmgsd.model.network import IMAGENET_MEAN, IMAGENET_STD, build_trunk, compute_taps, sample_descriptors
 from mmgsd.numerics import own_numerics
 
 Extractor = Callable[[np.ndarray], Any]  # (H, W, 3) uint8 -> (D, h, w)

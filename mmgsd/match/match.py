@@ -11,10 +11,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from mmgsd.match.calibration import Calibration, Gaussian, Modes, compute_share
+from mmgsd.model.calibration import Calibration, Gaussian, Modes, compute_share
 from mmgsd.numerics import numpy_defaults
 
 RADIUS_PX = 20.0  # of a training image, within which a robot's grasp still holds, unless the caller says otherwise
+LIKELY = 0.5  # from here on something is said to be so
 SHARED = (
     "image0",
     "image1",
@@ -190,6 +191,20 @@ class Match:
         if self.on_object is not None:
             able &= self.on_object >= 0.5
         return able if self.absent is None else able & (self.absent <= 0.5)
+
+    def say_presence(self, query: int = 0) -> str:
+        """Why a query has no answer: image1 lacks the object, or the pixel is background; "" where it has one."""
+        if self.absent is not None and self.absent[query] > LIKELY:
+            return f"absent: image1 does not show the object ({self.absent[query]:.0%} sure)"
+        if self.on_object is not None and self.on_object[query] < LIKELY:
+            return f"background: the pixel is not on the object ({1 - self.on_object[query]:.0%} sure)"
+        return ""
+
+    def find_hidden(self, query: int = 0) -> np.ndarray:
+        """(n,) bool, which modes' matches are likely there but hidden by something, as far as that is known."""
+        if self.visible is None:
+            return np.zeros(self.modes.shape[1], bool)
+        return self.visible[query] < LIKELY
 
     def __len__(self) -> int:
         return len(self.xy)

@@ -19,15 +19,20 @@ from torch import Tensor
 from mmgsd.checks import read_flag
 from mmgsd.config import CONTRASTIVE, OBJECTS, TrainConfig
 from mmgsd.images import check_aspect, check_mask, check_pixels, to_rgb
-from mmgsd.learn.heads import Outputs, look_up, weigh_cells
-from mmgsd.learn.losses import compute_squared_distances
-from mmgsd.learn.network import compute_cell_centres, find_device, fit_input_size, sample_descriptors
-from mmgsd.match.calibration import Calibration
 from mmgsd.match.joint import join, spread_places
 from mmgsd.match.match import Match, sort_modes
 from mmgsd.match.mixture import AS_IT_IS, Mixture, Reading, check_count, check_modes, fit_modes, keep_most_probable
 from mmgsd.match.places import Flat, Place, lay_flat
-from mmgsd.match.weights import read_weights
+from mmgsd.model.calibration import Calibration
+from mmgsd.model.heads import Outputs, look_up, weigh_cells
+from mmgsd.model.network import (
+    compute_cell_centres,
+    compute_squared_distances,
+    find_device,
+    fit_input_size,
+    sample_descriptors,
+)
+from mmgsd.model.weights import read_weights
 from mmgsd.numerics import own_numerics
 from mmgsd.paths import find_shipped
 

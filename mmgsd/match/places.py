@@ -11,11 +11,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-import torch
 from torch import Tensor
 
 from mmgsd.config import N_POINTS, OBJECTS
-from mmgsd.learn.heads import Outputs
+from mmgsd.model.heads import Outputs
 from mmgsd.symmetry import load_group
 
 SIDE = round(N_POINTS**0.5)
@@ -108,10 +107,3 @@ def _draw_line(count: int) -> tuple[np.ndarray, np.ndarray]:
     mask[LINE_PX // 2 - 1 : LINE_PX // 2 + 1] = True
     image = np.where(mask, EDGE, GROUND).astype(np.uint8)
     return np.repeat(image[..., None], 3, 2), mask
-
-
-def check_places(values: Tensor, descriptor_dim: int) -> Tensor:
-    """Descriptors (P, D) as float32; ValueError for another shape or what is not finite."""
-    if values.ndim != 2 or not len(values) or values.shape[1] != descriptor_dim or not values.isfinite().all():
-        raise ValueError(f"places must be finite, (P, {descriptor_dim}), got {tuple(values.shape)}")
-    return values.to(torch.float32)

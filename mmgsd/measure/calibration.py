@@ -22,10 +22,7 @@ from torch import Tensor
 from mmgsd.checks import read_count, read_flag
 from mmgsd.config import EvaluateConfig
 from mmgsd.dataset import Dataset, hold_out, join_datasets, load_dataset, load_parts, sample_pairs
-from mmgsd.learn.checkpoints import load_metadata, read_tensors, write_tensors
-from mmgsd.match.calibration import LEVELS, Calibration, Modes, compute_unit
 from mmgsd.match.matcher import Matcher
-from mmgsd.match.weights import PLACES
 from mmgsd.measure.questions import ask, choose_points, describe, measure_mean_error, model_answer
 from mmgsd.measure.reading import choose_reading
 from mmgsd.measure.uncertainty import (
@@ -37,6 +34,9 @@ from mmgsd.measure.uncertainty import (
     measure_modes,
     recalibrate,
 )
+from mmgsd.model.calibration import LEVELS, Calibration, Modes, compute_unit
+from mmgsd.model.tensors import load_metadata, read_tensors, write_tensors
+from mmgsd.model.weights import PLACES
 from mmgsd.numerics import own_numerics
 
 BANDWIDTHS = (1 / 64, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2)  # of a contrastive heatmap, in margins

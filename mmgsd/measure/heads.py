@@ -15,12 +15,12 @@ from mmgsd.checks import read_flag
 from mmgsd.config import EvaluateConfig, digest
 from mmgsd.dataset import Dataset, load_dataset
 from mmgsd.files import DamagedFileError, read_json, set_aside, write_json
-from mmgsd.learn.heads import Outputs, look_up
-from mmgsd.learn.network import compute_cell_centres
 from mmgsd.match.matcher import Matcher, read_heatmap
 from mmgsd.measure.metrics import assign_modes
 from mmgsd.measure.questions import choose_points, describe, draw_pairs
 from mmgsd.measure.uncertainty import compute_auroc
+from mmgsd.model.heads import Outputs, look_up
+from mmgsd.model.network import compute_cell_centres
 from mmgsd.progress import ProgressBar
 
 MEASURES = ("mask_iou", "auroc_on_object", "auroc_visible", "auroc_absent", "auroc_absent_textile",

@@ -22,11 +22,11 @@ import numpy as np
 from mmgsd.command import run_command
 from mmgsd.config import DEFAULT_GROUP, EvaluateConfig
 from mmgsd.dataset import Dataset, load_dataset
-from mmgsd.learn.training import name_hardware
 from mmgsd.match.match import RADIUS_PX, Match
 from mmgsd.match.matcher import Matcher, find_weights
 from mmgsd.measure.evaluation import read_results, write_results
 from mmgsd.measure.questions import draw_pairs
+from mmgsd.model.network import name_hardware
 from mmgsd.paths import Paths, find_root
 from mmgsd.progress import ProgressBar
 

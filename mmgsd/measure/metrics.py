@@ -10,7 +10,7 @@ import pandas as pd
 from scipy.optimize import linear_sum_assignment
 
 from mmgsd.config import N_POINTS
-from mmgsd.match.calibration import compute_share
+from mmgsd.model.calibration import compute_share
 
 PCK_PX = (5, 10, 20)
 LISTS = ("mahalanobis2", "distance_px", "spread_px", "share")  # columns with n numbers a query

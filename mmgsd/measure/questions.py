@@ -11,11 +11,11 @@ from torch import Tensor
 
 from mmgsd.config import EvaluateConfig
 from mmgsd.dataset import Dataset, sample_pairs
-from mmgsd.learn.heads import Outputs
-from mmgsd.learn.network import compute_cell_centres
 from mmgsd.match.matcher import Matcher, read_heatmap
 from mmgsd.match.mixture import Mixture
 from mmgsd.measure.metrics import LISTS, compute_mode_lists, compute_query_errors
+from mmgsd.model.heads import Outputs
+from mmgsd.model.network import compute_cell_centres
 from mmgsd.progress import ProgressBar
 
 Answer = Callable[[int, int, np.ndarray, np.ndarray], tuple[Mixture, Tensor]]

@@ -14,12 +14,12 @@ from torch import Tensor
 
 from mmgsd.config import EvaluateConfig
 from mmgsd.dataset import Dataset
-from mmgsd.learn.network import compute_cell_centres
 from mmgsd.match.match import RADIUS_PX
 from mmgsd.match.matcher import Matcher
 from mmgsd.match.mixture import AS_IT_IS, Reading, fit_modes
 from mmgsd.measure.metrics import compute_query_errors
 from mmgsd.measure.questions import choose_points, describe, draw_pairs
+from mmgsd.model.network import compute_cell_centres
 from mmgsd.progress import ProgressBar
 
 POWERS = (1.0, 1.25, 1.5, 2.0)

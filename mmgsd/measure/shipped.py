@@ -1,22 +1,7 @@
-"""What shipped weights, and what one would pick instead, do on clean renders, on cluttered ones and on photographs.
-
-    python -m mmgsd.measure.shipped cloth cloth-paper daisy --photographs FOLDER    -> data/results/shipped.json
-    python -m mmgsd.measure.shipped cloth@1,1 --photographs FOLDER     its modes read with another power and sharpness
-    python -m mmgsd.measure.shipped robustness --photographs FOLDER    the models of that study, once they are trained
-    python -m mmgsd.measure.shipped cloth --cloth-renders FOLDER       and others' renders of a cloth
-
-A row a name: of weights in data/weights; of a baseline, which is asked about each object with the true masks, and in
-photographs with those that the shipped weights see, and whose modes are read as theirs; or of each model of a study of
-`STUDIES` of the preset `paper`, or of another with so many steps each (--preset quick --steps 300), which is asked
-about that preset's images. How modes are read (`mmgsd.match.mixture.Reading`) is the weights' own, unless the name says
-another after an @. The test images of the presets `SETS`, or of that one, have to be rendered, unless
---photographs-alone leaves them out: what a row has of the same weights stays. Tables of answers are kept, so that a
-killed call goes on.
-"""
+"""What weights, and what one would pick instead, do on clean renders, on cluttered ones and on photographs."""
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import hashlib
 import statistics
@@ -28,23 +13,16 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from mmgsd.checks import read_count
-from mmgsd.command import run_command
-from mmgsd.config import OBJECTS, PRESETS, EvaluateConfig, Preset, load_preset
+from mmgsd.config import EvaluateConfig, load_preset
 from mmgsd.dataset import load_dataset
 from mmgsd.dataset_format import SPLITS
-from mmgsd.experiments import configure_study
-from mmgsd.files import read_json, write_json
-from mmgsd.learn.checkpoints import WEIGHTS
-from mmgsd.learn.training import name_hardware
-from mmgsd.match.baselines import BASELINES, BaselineMatcher, FeatureMatcher
-from mmgsd.match.calibration import Calibration
+from mmgsd.files import read_json
+from mmgsd.match.baselines import BaselineMatcher, FeatureMatcher
 from mmgsd.match.match import RADIUS_PX, Match
 from mmgsd.match.matcher import Matcher, find_weights
 from mmgsd.match.mixture import AS_IT_IS, Reading
 from mmgsd.measure.cloth_renders import measure_cloth_renders
-from mmgsd.measure.evaluation import evaluate_baseline, evaluate_model, load_queries, read_results
-from mmgsd.measure.figure_data import PLAIN
+from mmgsd.measure.evaluation import evaluate_baseline, evaluate_model, load_queries
 from mmgsd.measure.heads import MEASURES as HEADS
 from mmgsd.measure.heads import evaluate_heads
 from mmgsd.measure.metrics import aggregate
@@ -56,15 +34,16 @@ from mmgsd.measure.uncertainty import (
     measure_modes,
     summarise_uncertainty,
 )
-from mmgsd.paths import Paths, find_root
+from mmgsd.model.calibration import Calibration
+from mmgsd.model.network import name_hardware
+from mmgsd.paths import Paths
 
-STUDIES = ("robustness", "backbones")
 SETS = ("paper", "workspace")  # presets whose test images are asked about
 LEVEL = 0.9  # of the radii whose promise is checked
 HEAD_PAIRS = 100  # of images whose modes are judged
 TIMED = 9  # questions, of which the median counts
+PLAIN = ("flat", "straight")  # states of the objects
 SIDE_POINTS = {"cloth": 25, "rope": 625}  # material points, the first ones, that lie along it
-RESULTS = "shipped.json"
 
 
 def measure_weights(
@@ -215,77 +194,3 @@ def measure_baseline(
         masked = Masked(BaselineMatcher(method, reading=reading), segmenter, modes=segmenter.modes)
         row["photographs"] = measure_answers(masked, read_photographs(photographs, object), progress=progress)
     return row
-
-
-def measure_study(
-    study: str,
-    root: Path,
-    preset: Preset,
-    *,
-    objects: Sequence[str] = (),
-    steps: int = 0,
-    photographs: Path | None = None,
-) -> dict[str, dict[str, Any]]:
-    """The rows of a study's models, those of some ``objects`` where they are named.
-
-    {object-row: as `measure_weights`, with the preset and the ``steps`` of each}.
-
-    FileNotFoundError where one is not trained yet.
-    """
-    paths = Paths(root, preset.name)
-    keyed = {name: configure_study(preset, name, study, steps=steps) for name in objects or OBJECTS}
-    models = {f"{name}-{key}": model for name, rows in keyed.items() for key, model in rows.items()}
-    files = {key: paths.model(model) / WEIGHTS for key, model in models.items()}
-    missing = [str(file) for file in files.values() if not file.is_file()]
-    if missing:
-        asked = f"{preset.name} --study {study}" + (f" --steps {steps}" if steps else "")
-        raise FileNotFoundError(f"{missing[0]} does not exist: run python -m mmgsd.measure.matrix {asked}")
-    how = {"photographs": photographs, "presets": (preset.name, preset.cluttered)}
-    return {key: measure_weights(key, root, weights=file, **how) | {"preset": preset.name, "steps": models[key].steps}
-            for key, file in files.items()}  # fmt: skip
-
-
-def _measure(name: str, root: Path, args: argparse.Namespace) -> dict[str, dict[str, Any]]:
-    """The rows of a name that is asked for."""
-    if name in STUDIES:
-        how = {"objects": (args.object,) if args.object else (), "steps": args.steps, "photographs": args.photographs}
-        return measure_study(name, root, load_preset(args.preset), **how)
-    how = {"photographs": args.photographs, "presets": () if args.photographs_alone else SETS}
-    if name in BASELINES:
-        rows = {f"{object}-{name}": measure_baseline(name, object, root, **how) for object in OBJECTS}
-        return {name_read(key, row): row for key, row in rows.items()}
-    measure = measure_read if "@" in name else measure_weights
-    return {name: measure(name, root, cloth_renders=args.cloth_renders, **how)}
-
-
-def main() -> None:
-    """Measure some weights and baselines and put their rows into the results."""
-    parser = argparse.ArgumentParser(prog="python -m mmgsd.measure.shipped", description=__doc__.split("\n")[0])
-    parser.add_argument(
-        "names",
-        nargs="+",
-        metavar="NAME",
-        help=f"weights in data/weights, alone or with @POWER,SHARPNESS, {', '.join((*BASELINES, *STUDIES))}",
-    )
-    parser.add_argument("--photographs", type=Path, metavar="FOLDER", help="marked photographs, with index.json")
-    parser.add_argument(
-        "--photographs-alone", action="store_true", help="leave the presets' test images out: they take longest"
-    )
-    parser.add_argument("--cloth-renders", type=Path, metavar="FOLDER", help="others' renders, with knots_info.json")
-    parser.add_argument("--preset", default=SETS[0], choices=tuple(PRESETS), help=f"of the study (default: {SETS[0]})")
-    parser.add_argument("--steps", type=int, default=0, help="of each model of a study (default: the study's own)")
-    parser.add_argument("--object", default="", choices=OBJECTS, help="of a study's models those of one object")
-    args = parser.parse_args()
-    root, args.steps = find_root(), read_count("--steps", args.steps)
-    out = root / "data" / "results" / RESULTS
-    for name in args.names:
-        rows = _measure(name, root, args)
-        kept = read_results(out)
-        for key, row in rows.items():  # photographs are not at everybody's hand: a call without them keeps the row's
-            before = kept.get(key, {})
-            kept[key] = (before if before.get("sha256") == row.get("sha256") else {}) | row
-        print(f"{write_json(out, kept)}: {', '.join(rows)}")
-
-
-if __name__ == "__main__":
-    run_command(main)

@@ -11,9 +11,9 @@ import pandas as pd
 from scipy.stats import chi2, spearmanr
 from sklearn.metrics import roc_auc_score
 
-from mmgsd.match.calibration import LEVELS as TABLED
-from mmgsd.match.calibration import Calibration, Gaussian, Modes
 from mmgsd.measure.metrics import LISTS
+from mmgsd.model.calibration import LEVELS as TABLED
+from mmgsd.model.calibration import Calibration, Gaussian, Modes
 
 LEVELS = TABLED[:-1]  # expected coverage of a mode's ellipse: 5, 10 … 95 %
 REPORTED = (0.5, 0.9, 0.95)

@@ -13,7 +13,8 @@ from typing import Any
 from scipy.stats import spearmanr
 
 from mmgsd.config import OBJECTS
-from mmgsd.report.results import PAPER, PEAK
+from mmgsd.report.results import PEAK
+from mmgsd.studies.models import PAPER
 
 HELD, IN_PART, NOT_HELD, NOT_MEASURED = "held", "held in part", "did not hold", "not measured"
 MARGIN = 0.05  # two errors that differ by less are not told apart: one training each, one seed

@@ -15,9 +15,8 @@ from typing import Any
 from scipy import stats
 
 from mmgsd.config import OBJECTS
-from mmgsd.experiments import MODELS, UNTRAINED, get_label
 from mmgsd.report.claims import get
-from mmgsd.report.results import PAPER
+from mmgsd.studies.models import MODELS, PAPER, UNTRAINED, get_label
 
 TABLED = ("main", "robustness", "hand_made", "chance")
 LABELS = {row.name: row.label for row in (*MODELS, *UNTRAINED) if {*row.studies} & {*TABLED}}  # rows in their order

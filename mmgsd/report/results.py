@@ -15,7 +15,6 @@ from mmgsd.files import DamagedFileError, read_json
 from mmgsd.measure.regions import MAP, measure_rings
 
 REMEDY = "restore it (it may be in git), or run its notebook again with run=True"
-PAPER = {"cloth": 32.4, "rope": 31.3}  # px, MMGSD's RMSE as the paper reports it
 FILES = (
     "rmse", "runs", "budget", "sigma", "uncertainty", "symmetry", "broken_symmetry", "errors", "seeds_1000", "entropy",
     "continuity", "grasp",
@@ -70,10 +69,10 @@ def read_folding(path: Path) -> dict[str, dict[str, Any]]:
 
 
 def count_peaks(path: Path) -> int:
-    """How many peaks the distribution of MMGSD's error has, as it is drawn (`mmgsd.figures.plots.plot_rmse_pdf`)."""
-    from mmgsd.figures.plots import compute_density  # with matplotlib: only where it is needed
-    from mmgsd.measure.figure_data import load_figure_data
+    """How many peaks the distribution of MMGSD's error has, as it is drawn (`mmgsd.studies.main.plot_rmse_pdf`)."""
     from mmgsd.measure.metrics import BIN_PX
+    from mmgsd.studies.figure_data import load_figure_data
+    from mmgsd.studies.main import compute_density  # with matplotlib: only where it is needed
 
     data = load_figure_data(path)
     _, density = compute_density(data.errors["mmgsd"].histogram, 100 * BIN_PX / data.object_size_px)
@@ -82,8 +81,8 @@ def count_peaks(path: Path) -> int:
 
 def measure_places(path: Path, name: str) -> dict[str, float]:
     """MMGSD's mean error (px) by place on the object: ``corner``, ``edge``, ``interior``, or ``end``, ``middle``."""
-    from mmgsd.measure.figure_data import load_figure_data  # with torch: only where it is needed
     from mmgsd.measure.regions import find_regions
+    from mmgsd.studies.figure_data import load_figure_data  # with torch: only where it is needed
 
     errors = load_figure_data(path).errors["mmgsd"]
     if name == "cloth":

@@ -13,10 +13,10 @@ from mmgsd.command import run_command
 from mmgsd.files import write_text
 from mmgsd.report import descriptions as described
 from mmgsd.report.findings import describe_claims, make_findings
-from mmgsd.report.folding import make_folding_sentence, make_folding_table, make_grasp_table, make_starts_table
-from mmgsd.report.joint import make_joint_sentence, make_joint_table
 from mmgsd.report.results import load_results, read_table, told_where
-from mmgsd.report.shipped import (
+from mmgsd.studies.folding_tables import make_folding_sentence, make_folding_table, make_grasp_table, make_starts_table
+from mmgsd.studies.joint import make_joint_sentence, make_joint_table
+from mmgsd.studies.shipped import (
     make_budget_sentence,
     make_by_source_table,
     make_cloth_renders_table,

@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from mmgsd.experiments import UNTRAINED
 from mmgsd.files import DamagedFileError, set_aside, write_json, write_text
 from mmgsd.paths import Paths
 from mmgsd.report.claims import get
 from mmgsd.report.results import read_table, told_where
 from mmgsd.report.stages import find_run
+from mmgsd.studies.models import UNTRAINED
 
 DEVIATIONS = 3  # of the seeds: as far as another training of the same model may be
 COMPARED = ("rmse", "sigma", "uncertainty")  # results files that the stages write, with a row a model or method

@@ -172,19 +172,21 @@ def render_batch(job: dict) -> bytes:
         return data
 
 
-def run_job(job: dict, folder: Path, doing: str, outs: Sequence[Path]) -> list[bytes]:
+def run_job(
+    job: dict, folder: Path, doing: str, outs: Sequence[Path], *, module: str = "mmgsd.scene"
+) -> list[bytes]:  # fmt: skip
     """What a child writes to ``outs`` (see `run_child`); RenderError, which says what it was ``doing``, where it fails.
 
     It ends with this process.
     """
-    code, stderr = run_child(job | {"parent": os.getpid()}, folder)
+    code, stderr = run_child(job | {"parent": os.getpid()}, folder, module=module)
     if code or not all(out.is_file() for out in outs):
         raise RenderError(f"{doing} {_describe_exit(code)}:\n{stderr[-2000:]}")
     return [out.read_bytes() for out in outs]
 
 
-def run_child(job: dict, folder: Path) -> tuple[int, str]:
-    """Exit code and stderr of a child that renders ``job``, with ``folder`` for all its temporary files."""
+def run_child(job: dict, folder: Path, *, module: str = "mmgsd.scene") -> tuple[int, str]:
+    """Exit code and stderr of a child that does ``job``, with ``folder`` for all its temporary files."""
     place = str(Path(__file__).resolve().parents[2])
     path = os.pathsep.join(filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep)))  # an empty one is the cwd
     # as many children as cores, so one thread in each
@@ -193,7 +195,7 @@ def run_child(job: dict, folder: Path) -> tuple[int, str]:
     pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
     # a session of its own: Ctrl-C stops the parent, which ends its children, and none of them fails and is tried again
     with subprocess.Popen(
-        [sys.executable, "-c", CHILD, "mmgsd.scene", place], env=env, text=True, start_new_session=True, **pipes
+        [sys.executable, "-c", CHILD, module, place], env=env, text=True, start_new_session=True, **pipes
     ) as child:
         _children.add(child)
         try:

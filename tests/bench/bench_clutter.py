@@ -13,11 +13,11 @@ from bench_learning import measure_pace
 
 from mmgsd.command import run_command
 from mmgsd.config import OBJECTS, load_preset
-from mmgsd.experiments import configure_model
 from mmgsd.files import write_json
-from mmgsd.learn.training import name_hardware
-from mmgsd.parameters import check_images
+from mmgsd.model.network import name_hardware
 from mmgsd.paths import Paths, find_root
+from mmgsd.studies.models import configure_model
+from mmgsd.studies.parameters import check_images
 
 ROUNDS = 2
 

@@ -23,13 +23,14 @@ import pandas as pd
 from mmgsd.command import run_command
 from mmgsd.config import METHODS, OBJECTS, TrainConfig, load_preset
 from mmgsd.dataset import hold_out, load_dataset
-from mmgsd.experiments import configure_model
-from mmgsd.learn.checkpoints import LOG, load_metadata
+from mmgsd.learn.checkpoints import LOG
 from mmgsd.learn.training import train_model
 from mmgsd.match.matcher import Matcher
 from mmgsd.measure.questions import measure_rmse
-from mmgsd.parameters import check_images
+from mmgsd.model.tensors import load_metadata
 from mmgsd.paths import Paths, find_root
+from mmgsd.studies.models import configure_model
+from mmgsd.studies.parameters import check_images
 
 PACE_STEPS = 20  # steps that the pace is measured on, after as many to warm up
 

@@ -23,13 +23,13 @@ from sklearn.mixture import GaussianMixture
 from mmgsd.command import run_command
 from mmgsd.config import ROUNDNESS, load_preset
 from mmgsd.dataset import load_dataset, sample_pairs
-from mmgsd.learn.checkpoints import WEIGHTS
-from mmgsd.learn.network import compute_cell_centres
 from mmgsd.match.matcher import Matcher, read_heatmap
 from mmgsd.match.mixture import PRIOR_WEIGHT
 from mmgsd.measure.metrics import compute_mode_errors
-from mmgsd.parameters import check_images, check_made
+from mmgsd.model.network import compute_cell_centres
+from mmgsd.model.tensors import WEIGHTS
 from mmgsd.paths import Paths, find_root
+from mmgsd.studies.parameters import check_images, check_made
 
 MODES, PLAIN, AGREE_PX = 4, 100, 0.25  # modes; queries asked the plain way
 DRAWN = 10_000  # pixels drawn for each; 640,000 take 0.2 queries/s and still move the modes by 4 px

@@ -21,7 +21,8 @@ SPLIT = """
 import io, os, sys, time, zipfile
 os.environ.setdefault("MMGSD_THREADS", "1")
 from mmgsd.config import RenderConfig
-from mmgsd.scene.__main__ import one_core, silenced, write_view
+from mmgsd.scene.__main__ import write_view
+from mmgsd.scene.child import one_core, silenced
 clock = {}
 def timed(module, name, label):
     function = getattr(module, name)

@@ -27,10 +27,10 @@ from mmgsd.extras.explorer_scenes import (
     load_shipped,
     make_scenes,
 )
-from mmgsd.learn.network import build_network
 from mmgsd.match.baselines import BaselineMatcher
 from mmgsd.match.describe import describe_answer
 from mmgsd.match.matcher import Matcher
+from mmgsd.model.network import build_network
 
 CONFIG = TrainConfig(input_px=64, descriptor_dim=4)
 

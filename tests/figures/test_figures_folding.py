@@ -15,9 +15,9 @@ from mmgsd.figures.folding import (
     mark_success,
     plot_moves,
     plot_rollouts,
-    plot_success,
     save_slides,
 )
+from mmgsd.studies.folding import plot_success
 
 PICTURE = np.zeros((48, 64, 3), np.uint8)
 

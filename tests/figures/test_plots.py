@@ -7,39 +7,12 @@ import dataclasses
 import numpy as np
 import pandas as pd
 import pytest
+from heatmaps import make_match
 from matplotlib.figure import Figure
 from matplotlib.patches import ConnectionPatch
 
-from mmgsd.experiments import get_colour
 from mmgsd.figures import answers, plots
 from mmgsd.figures import style as drawing
-from mmgsd.match.match import Match
-from mmgsd.measure.metrics import BIN_PX, ErrorSummary, summarise_errors
-
-
-def make_match(queries: int = 1, modes: int = 2, *, height: int = 40, width: int = 60) -> Match:
-    rng = np.random.default_rng(0)
-    images = rng.integers(0, 255, (2, height, width, 3), dtype=np.uint8)
-    xy = rng.uniform(5, 35, (queries, 2)).astype(np.float32)
-    centres = rng.uniform(5, 35, (queries, modes, 2))
-    covariances = np.broadcast_to([[9.0, 2.0], [2.0, 4.0]], (queries, modes, 2, 2))
-    cells = rng.random((queries, height // 4, width // 4)).astype(np.float32)
-    weights = np.full((queries, modes), 1 / modes)
-    cells /= cells.sum((1, 2), keepdims=True)
-    entropy, outside = np.full(queries, 7.25), np.zeros(queries)
-    return Match(*images, xy, centres, weights, covariances, entropy, outside, cells)
-
-
-def make_queries(error: float = 20.0, points: int = 625) -> pd.DataFrame:
-    point = np.tile(np.unique(np.linspace(0, 624, points).round().astype(int)), 2)
-    visible = np.arange(len(point)) % 5 > 0
-    rmse = np.where(visible, error, 1e6)  # a hidden source must not count
-    return pd.DataFrame({"point": point, "visible": visible, "rmse_px": rmse})
-
-
-def make_errors(points: int = 625) -> dict[str, dict[str, ErrorSummary]]:
-    errors = {"mmgsd": 20.0, "spcl": 40.0, "centre": 80.0}
-    return {o: {m: summarise_errors(make_queries(e, points)) for m, e in errors.items()} for o in ("cloth", "rope")}
 
 
 def test_plot_match_shows_source_and_answer_with_entropy():
@@ -140,106 +113,6 @@ def test_the_teaser_marks_every_match_and_leads_to_it_from_the_pixel():
     assert len(source.collections) == 1
 
 
-def test_plot_combined_has_five_columns():
-    methods = {method: make_match() for method in ("pcl", "spcl", "mmgsd")}
-    true = np.array([[10.0, 10.0], [30.0, 20.0]])
-    figure = answers.plot_combined({"rope": methods}, {"rope": true}, {"rope": make_match(4)})
-    assert len(figure.axes) == 10
-    shown = figure.axes[3].images[0].get_array()
-    assert shown.shape == (40, 60, 3)
-    assert shown[10, 10, 0] > 0.9  # the heatmap's brightest colour at a true mode
-
-
-def test_plot_combined_marks_modes_and_true_matches():
-    methods = {method: make_match() for method in ("pcl", "spcl", "mmgsd")}
-    true = np.array([[10.0, 10.0], [30.0, 20.0]])
-    source, *compared, first = answers.plot_combined({"rope": methods}, {"rope": true}, {"rope": make_match(4)}).axes[
-        :6
-    ]
-    assert [len(axis.patches) for axis in compared] == [2, 2, 0, 2]  # an ellipse a mode
-    for axis in compared:
-        np.testing.assert_array_equal(axis.collections[-1].get_offsets(), true)
-    assert [text.get_text() for text in first.texts] == ["1", "2", "3", "4"]
-
-
-def test_plot_combined_says_what_is_not_trained():
-    methods = {method: make_match() for method in ("spcl", "mmgsd")}
-    figure = answers.plot_combined({"rope": methods}, {"rope": np.array([[10.0, 10.0]])}, {})
-    assert [len(axis.images) for axis in figure.axes] == [1, 0, 1, 1, 1]
-    assert [text.get_text() for text in figure.axes[1].texts] == ["not trained"]
-
-
-def test_plot_combined_wants_four_queries_inwards():
-    with pytest.raises(ValueError, match="must hold 4 queries, got 3"):
-        answers.plot_combined({"rope": {"mmgsd": make_match()}}, {}, {"rope": make_match(3)})
-
-
-def test_compute_density_is_one_in_all_and_highest_at_the_data():
-    centres, density = plots.compute_density(np.bincount([48] * 100), 0.25)
-    assert density.sum() * 0.25 == pytest.approx(1, abs=1e-3)
-    assert centres[density.argmax()] == pytest.approx(12.125)
-
-
-def test_compute_density_loses_nothing_at_zero():
-    _, density = plots.compute_density(np.array([10]), 0.25)
-    assert density.sum() * 0.25 == pytest.approx(1, abs=1e-3)
-    assert density.argmax() == 0
-
-
-def test_plot_rmse_pdf_draws_visible_queries_in_percent():
-    figure = plots.plot_rmse_pdf(make_errors(), {"cloth": 200.0, "rope": 100.0})
-    assert len(figure.axes) == 2
-    for axis, peaks in zip(figure.axes, ((10, 20, 40), (20, 40, 80)), strict=True):
-        found = [line.get_xdata()[line.get_ydata().argmax()] for line in axis.lines]
-        assert found == pytest.approx(peaks, abs=BIN_PX)
-    assert figure.axes[0].get_xlim()[1] == pytest.approx(40, abs=2 * BIN_PX)  # most errors of all methods but chance
-    assert [line.get_linestyle() for line in figure.axes[0].lines] == ["-", "-", "--"]
-    assert figure.axes[0].lines[0].get_color() == get_colour("mmgsd")
-
-
-@pytest.mark.parametrize("points", [625, 25])
-def test_plot_spatial_rmse_draws_lines_and_maps(points):
-    figure = plots.plot_spatial_rmse(make_errors(points))
-    assert len(figure.axes) == 5  # the last two are the colour bars
-    assert figure.axes[0].lines[1].get_ydata() == pytest.approx(40)
-    values = [axis.images[0].get_array() for axis in figure.axes[1:3]]
-    assert [float(v.mean()) for v in values] == pytest.approx([20, 40])
-    assert [axis.images[0].get_clim()[1] for axis in figure.axes[1:3]] == pytest.approx([22, 44])  # each by its own
-    errors = make_errors(points)
-    del errors["cloth"]["spcl"]  # not trained
-    assert len(plots.plot_spatial_rmse(errors).axes) == 3
-
-
-def test_plot_sigma_ablation_sorts_by_sigma():
-    results = {"cloth": {"16": {"rmse_mean": 60.0}, "2": {"rmse_mean": 30.0}}, "rope": {"2": {"rmse_mean": 20.0}}}
-    cloth, rope = plots.plot_sigma_ablation(results).axes
-    assert cloth.lines[0].get_xdata().tolist() == [2, 16]
-    assert cloth.lines[0].get_ydata().tolist() == [30, 60]
-    assert [text.get_text() for text in (*cloth.texts, *rope.texts)] == ["30.0", "60.0", "20.0"]
-
-
-def test_other_seeds_are_rings_beside_the_narrowest_target():
-    results = {"cloth": {"1": {"rmse_mean": 42.6}, "16": {"rmse_mean": 38.5}}}
-    rows = {f"{key}": {"rmse_mean": value} for key, value in
-            {"mmgsd-0": 42.6, "mmgsd-1": 38.1, "spcl-1": 50.0, "mmgsd_deep-1": 3.0}.items()}  # fmt: skip
-    (axis,) = plots.plot_sigma_ablation(results, seeds={"cloth": rows}).axes
-    assert axis.lines[1].get_xdata().tolist() == [1] and axis.lines[1].get_ydata().tolist() == [38.1]
-
-
-def test_lines_that_lie_on_others_are_seen():
-    mmgsd, unimodal, spcl, pcl = map(drawing.get_line_style, ("mmgsd", "unimodal", "spcl", "pcl"))
-    assert pcl["zorder"] > spcl["zorder"] and unimodal["zorder"] > mmgsd["zorder"] > spcl["zorder"]
-    assert pcl["linestyle"] != "-" == spcl["linestyle"]
-
-
-def test_plot_training_has_a_panel_a_model():
-    log = pd.DataFrame({"step": range(1, 6), "loss": [5.0, 4, 3, 2, 1], "seconds": range(60, 310, 60)})
-    figure = plots.plot_training({"cloth mmgsd": log, "rope pcl": log, "rope mmgsd": log}, columns=2)
-    assert len(figure.axes) == 3
-    assert figure.axes[0].lines[0].get_ydata().tolist() == [5, 4, 3, 2, 1]
-    assert figure.axes[0].get_title() == "Cloth MMGSD · 5.0 min"
-
-
 def test_plot_samples_fills_a_sheet(rng):
     images = list(rng.integers(0, 255, (5, 20, 30, 3), dtype=np.uint8))
     figure = plots.plot_samples(images, [str(i) for i in range(5)], columns=3)
@@ -296,15 +169,9 @@ def test_a_number_of_modes_has_one_colour_for_all_objects():
 
 
 def test_compute_point_colours_differ_at_the_corners():
-    colours = drawing.compute_point_colours("cloth")
+    colours = drawing.compute_point_colours("cloth", 625)
     assert colours.shape == (625, 3) and colours.min() >= 0 and colours.max() <= 1
     assert len(np.unique(colours[[0, 24, 600, 624]], axis=0)) == 4
-
-
-def test_compute_object_size_is_the_mean_diagonal():
-    mask = np.zeros((20, 20), bool)
-    mask[2:5, 3:7] = True  # 3 x 4 px
-    assert plots.compute_object_size([mask, mask]) == pytest.approx(5)
 
 
 def test_save_figure_gives_the_same_bytes_twice(tmp_path):
@@ -317,17 +184,9 @@ def test_save_figure_gives_the_same_bytes_twice(tmp_path):
 
 @pytest.mark.parametrize("call", [
     lambda: answers.plot_teaser({}),
-    lambda: answers.plot_combined({}, {}, {}),
-    lambda: plots.plot_rmse_pdf({}, {}),
-    lambda: plots.plot_rmse_pdf({"cloth": {}}, {"cloth": 1.0}),
-    lambda: plots.compute_density(np.zeros(3, int), 0.25),
-    lambda: plots.plot_spatial_rmse({}),
-    lambda: plots.plot_sigma_ablation({}),
-    lambda: plots.plot_training({}),
     lambda: plots.plot_samples([]),
     lambda: plots.plot_orbits(np.zeros((4, 4, 3), np.uint8), np.zeros((3, 2)), {}),
     lambda: plots.plot_variety({}, {}),
-    lambda: plots.compute_object_size([]),
 ])  # fmt: skip
 def test_empty_input_is_an_error(call):
     with pytest.raises(ValueError, match="must not be empty"):
@@ -338,5 +197,5 @@ def test_no_figure_stays_open():
     from matplotlib import pyplot
 
     before = pyplot.get_fignums()  # of other tests
-    plots.plot_sigma_ablation({"cloth": {"1": {"rmse_mean": 1.0}}})
+    plots.plot_samples([np.zeros((4, 4, 3), np.uint8)])
     assert pyplot.get_fignums() == before

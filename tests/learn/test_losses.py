@@ -12,8 +12,8 @@ from scipy.stats import norm
 from torch import Tensor
 
 from mmgsd.learn import losses
-from mmgsd.learn.losses import compute_squared_distances, compute_target
-from mmgsd.learn.network import compute_cell_centres
+from mmgsd.learn.losses import compute_target
+from mmgsd.model.network import compute_cell_centres, compute_squared_distances
 
 
 @pytest.fixture
@@ -36,31 +36,6 @@ def one_mode(x: float, y: float, sigma: float) -> tuple[Tensor, Tensor, Tensor]:
 def both(*values: float) -> tuple[Tensor, Tensor]:
     """Distances and a mask that keeps them all."""
     return torch.tensor(values), torch.ones(len(values), dtype=torch.bool)
-
-
-def test_squared_distances_are_cdists(generator: torch.Generator) -> None:
-    source, target = (torch.randn(3, n, 8, generator=generator, dtype=torch.float64) for n in (5, 7))
-    torch.testing.assert_close(compute_squared_distances(source, target), torch.cdist(source, target) ** 2)
-
-
-def test_squared_distances_are_never_negative(generator: torch.Generator) -> None:
-    same = 100 + torch.randn(1, 50, 16, generator=generator)
-    assert compute_squared_distances(same, same).min() >= 0
-
-
-def test_squared_distances_gradient(generator: torch.Generator) -> None:
-    source, target = (
-        torch.randn(2, n, 3, generator=generator, dtype=torch.float64, requires_grad=True) for n in (3, 4)
-    )
-    assert torch.autograd.gradcheck(compute_squared_distances, (source, target))
-
-
-@pytest.mark.parametrize("name", ["source", "target"])
-def test_descriptors_of_another_shape(name: str) -> None:
-    good, bad = torch.zeros(1, 2, 3), torch.zeros(2, 3)
-    arguments = (bad, good) if name == "source" else (good, bad)
-    with pytest.raises(ValueError, match=rf"{name} must have shape \(K, n, D\), got \(2, 3\)"):
-        compute_squared_distances(*arguments)
 
 
 def test_pcl_by_hand() -> None:

@@ -12,8 +12,8 @@ import torch
 from mmgsd.config import TrainConfig
 from mmgsd.dataset import load_dataset
 from mmgsd.learn.augmentation import load_training_images, make_batch
-from mmgsd.learn.network import build_network
 from mmgsd.learn.objective import compute_head_loss
+from mmgsd.model.network import build_network
 
 CONFIG = TrainConfig(input_px=64, descriptor_dim=8, heads=True, clutter=True, roles=2)
 

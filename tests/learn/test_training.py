@@ -22,7 +22,7 @@ from mmgsd.config import METHODS, TrainConfig
 from mmgsd.dataset import hold_out, load_dataset
 from mmgsd.files import LockedError, locked
 from mmgsd.learn import training
-from mmgsd.learn.checkpoints import CHECKPOINT, LOG, WEIGHTS, check_enough, load_metadata
+from mmgsd.learn.checkpoints import CHECKPOINT, LOG, check_enough
 from mmgsd.learn.objective import compute_loss, compute_sigma
 from mmgsd.learn.training import (
     compute_learning_rate,
@@ -31,6 +31,7 @@ from mmgsd.learn.training import (
     train_model,
 )
 from mmgsd.match.matcher import Matcher
+from mmgsd.model.tensors import WEIGHTS, load_metadata
 
 TINY = TrainConfig(steps=3, batch=4, pairs=6, queries=16, input_px=64, descriptor_dim=8)
 ONE_STEP, LONGER = dataclasses.replace(TINY, steps=1), dataclasses.replace(TINY, steps=4)
@@ -124,13 +125,6 @@ def test_a_model_of_another_data_set_is_not_taken_for_this_one(cloth_dataset: Pa
     (other / "dataset.json").write_text(json.dumps(info))
     with pytest.raises(ValueError, match="was trained on another data set"):
         train(ONE_STEP, other, tmp_path / "model")
-
-
-@pytest.mark.parametrize(("threads", "said"), [(8, "CPU, 8 cores"), (1, "CPU, 1 of 8 cores")])
-def test_the_hardware_is_what_was_used_of_it(monkeypatch: pytest.MonkeyPatch, threads: int, said: str) -> None:
-    monkeypatch.setattr(training.os, "cpu_count", lambda: 8)
-    monkeypatch.setattr(training.torch, "get_num_threads", lambda: threads)
-    assert training.name_hardware(torch.device("cpu")) == said
 
 
 def test_overwrite_trains_again_to_the_same_weights(cloth_dataset: Path, tmp_path: Path) -> None:

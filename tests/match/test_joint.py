@@ -12,11 +12,11 @@ import torch
 import mmgsd
 from mmgsd.config import DEFAULT_GROUP, TrainConfig
 from mmgsd.dataset import Dataset, load_dataset
-from mmgsd.learn.network import build_network
 from mmgsd.match import joint
 from mmgsd.match.joint import join, spread_places
 from mmgsd.match.match import Match
 from mmgsd.match.matcher import Matcher
+from mmgsd.model.network import build_network
 
 ROOT = Path(__file__).parents[2]
 SIDE = 200  # px of the square object

@@ -10,9 +10,9 @@ import pytest
 import torch
 from heatmaps import CELL_PX, CELLS, CORNERS, SIZE, draw_mixture, one_cell
 
-from mmgsd.learn.network import compute_cell_centres
 from mmgsd.match.match import Match
 from mmgsd.match.matcher import make_match
+from mmgsd.model.network import compute_cell_centres
 
 
 def answer(cells: torch.Tensor, n: int | str) -> Match:

@@ -14,13 +14,13 @@ from PIL import Image
 
 from mmgsd.config import NETWORKS, TrainConfig
 from mmgsd.dataset import load_dataset
-from mmgsd.learn.heads import Outputs
-from mmgsd.learn.network import build_network, compute_cell_centres
 from mmgsd.match import matcher as matching
 from mmgsd.match.baselines import BaselineMatcher
 from mmgsd.match.matcher import Matcher, compute_entropy, compute_heatmap, load, make_match, read_heatmap
 from mmgsd.match.mixture import Mixture, Reading
 from mmgsd.measure.metrics import compute_query_errors
+from mmgsd.model.heads import Outputs
+from mmgsd.model.network import build_network, compute_cell_centres
 
 CONFIG = TrainConfig(input_px=64, descriptor_dim=8)
 ROOT = Path(__file__).parents[2]

@@ -10,10 +10,10 @@ from heatmaps import CELL_PX, CELLS, CORNERS, XS, YS, draw_mixture, one_cell
 from sklearn.mixture import GaussianMixture
 from torch import Tensor
 
-from mmgsd.learn.network import compute_cell_centres
 from mmgsd.match import mixture
 from mmgsd.match.mixture import Reading, fit_modes
 from mmgsd.measure.metrics import compute_mode_errors
+from mmgsd.model.network import compute_cell_centres
 
 
 def measure_errors(modes: np.ndarray, true: np.ndarray) -> np.ndarray:

@@ -12,11 +12,11 @@ import torch
 import mmgsd
 from mmgsd.__main__ import main
 from mmgsd.dataset import Dataset, load_dataset
-from mmgsd.learn.checkpoints import read_tensors, write_tensors
 from mmgsd.match.matcher import Matcher, find_weights
 from mmgsd.match.places import NAMES, lay_flat
 from mmgsd.measure.calibration import describe_places
 from mmgsd.measure.photographs import measure_by_name, read_photographs
+from mmgsd.model.tensors import read_tensors, write_tensors
 from mmgsd.symmetry import load_group
 
 ROOT = Path(__file__).parents[2]

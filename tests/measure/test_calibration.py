@@ -14,9 +14,6 @@ from safetensors import safe_open
 
 from mmgsd.config import TrainConfig
 from mmgsd.dataset import load_dataset
-from mmgsd.learn.checkpoints import load_metadata, read_tensors, write_tensors
-from mmgsd.learn.network import build_network, compute_cell_centres
-from mmgsd.match.calibration import LEVELS, parse_calibration
 from mmgsd.match.matcher import Matcher
 from mmgsd.match.mixture import Reading
 from mmgsd.measure import calibration
@@ -33,6 +30,9 @@ from mmgsd.measure.calibration import (
 )
 from mmgsd.measure.questions import choose_points
 from mmgsd.measure.uncertainty import compute_coverage, get_distances, get_modes, measure_modes, recalibrate
+from mmgsd.model.calibration import LEVELS, parse_calibration
+from mmgsd.model.network import build_network, compute_cell_centres
+from mmgsd.model.tensors import load_metadata, read_tensors, write_tensors
 
 CONFIG = TrainConfig(input_px=64, descriptor_dim=4)
 

@@ -14,7 +14,6 @@ import torch
 
 from mmgsd.config import EvaluateConfig, TrainConfig
 from mmgsd.dataset import Dataset, load_dataset
-from mmgsd.learn.network import build_network
 from mmgsd.match.matcher import Matcher
 from mmgsd.match.mixture import Mixture, Reading
 from mmgsd.measure import evaluation, questions
@@ -29,6 +28,7 @@ from mmgsd.measure.evaluation import (
 )
 from mmgsd.measure.metrics import LISTS
 from mmgsd.measure.questions import choose_points, measure_rmse
+from mmgsd.model.network import build_network
 
 CONFIG = EvaluateConfig(pairs=3, points=5)
 CLOTH_SIDE_PX = 240.0  # of the synthetic cloths

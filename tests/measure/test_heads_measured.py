@@ -12,12 +12,12 @@ import torch
 
 from mmgsd.config import EvaluateConfig, TrainConfig
 from mmgsd.dataset import Dataset, load_dataset
-from mmgsd.learn.checkpoints import write_tensors
-from mmgsd.learn.heads import Outputs
-from mmgsd.learn.network import build_network
 from mmgsd.match.matcher import Matcher
 from mmgsd.measure import heads
 from mmgsd.measure.heads import MEASURES, evaluate_heads, measure_heads
+from mmgsd.model.heads import Outputs
+from mmgsd.model.network import build_network
+from mmgsd.model.tensors import write_tensors
 
 CONFIG = EvaluateConfig(pairs=2, points=5)
 

@@ -12,7 +12,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mmgsd.match.calibration import Calibration
 from mmgsd.measure.uncertainty import (
     LEVELS,
     compute_aurc,
@@ -25,6 +24,7 @@ from mmgsd.measure.uncertainty import (
     recalibrate,
     summarise_uncertainty,
 )
+from mmgsd.model.calibration import Calibration
 
 
 def make_queries(**columns: object) -> pd.DataFrame:

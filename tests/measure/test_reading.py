@@ -10,11 +10,11 @@ import torch
 
 from mmgsd.config import TrainConfig
 from mmgsd.dataset import load_dataset
-from mmgsd.learn.network import build_network
 from mmgsd.match.matcher import Matcher
 from mmgsd.match.mixture import Reading
 from mmgsd.measure import reading
 from mmgsd.measure.reading import ALLOWED, POWERS, SHARPNESSES, Asked, Quality, choose_reading, count_seen
+from mmgsd.model.network import build_network
 
 
 @pytest.fixture

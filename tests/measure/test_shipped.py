@@ -13,11 +13,13 @@ import pytest
 from test_heads_measured import write_weights
 
 from mmgsd.config import EvaluateConfig, load_preset
-from mmgsd.experiments import configure_study
 from mmgsd.match.matcher import Matcher
 from mmgsd.measure import shipped
-from mmgsd.measure.shipped import Masked, main, measure_baseline, measure_read, measure_study, measure_weights
+from mmgsd.measure.shipped import Masked, measure_baseline, measure_read, measure_weights
 from mmgsd.paths import Paths
+from mmgsd.studies import shipped as study
+from mmgsd.studies.models import configure_study
+from mmgsd.studies.shipped import main, measure_study
 
 SAMPLE = Path(__file__).parents[2] / "data" / "sample"
 
@@ -26,8 +28,9 @@ SAMPLE = Path(__file__).parents[2] / "data" / "sample"
 def root(tmp_path: Path, cloth_dataset: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A repository with two tiny sets of cloths, a sample and untrained weights under the name ``mine``."""
     small = dataclasses.replace(load_preset("paper"), evaluate=EvaluateConfig(pairs=2, points=5))
-    monkeypatch.setattr(shipped, "load_preset", lambda _: small)
-    monkeypatch.setattr(shipped, "OBJECTS", ("cloth",))
+    for module in (shipped, study):
+        monkeypatch.setattr(module, "load_preset", lambda _: small)
+    monkeypatch.setattr(study, "OBJECTS", ("cloth",))
     monkeypatch.setattr(shipped, "TIMED", 1)
     monkeypatch.setenv("MMGSD_ROOT", str(tmp_path))
     weights = write_weights(tmp_path)
@@ -85,9 +88,9 @@ def test_a_baseline_is_told_where_the_object_is_seen() -> None:
 
 def test_a_study_that_is_not_trained_says_how_to_train_it(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", [sys.executable, "robustness"])
-    with pytest.raises(FileNotFoundError, match="run python -m mmgsd.measure.matrix paper --study robustness"):
+    with pytest.raises(FileNotFoundError, match="run python -m mmgsd.studies.matrix paper --study robustness"):
         main()
-    monkeypatch.setattr(shipped, "load_preset", load_preset)
+    monkeypatch.setattr(study, "load_preset", load_preset)
     monkeypatch.setattr(sys, "argv", [sys.executable, "robustness", "--preset", "quick", "--steps", "7"])
     with pytest.raises(FileNotFoundError, match="matrix quick --study robustness --steps 7"):
         main()
@@ -99,7 +102,7 @@ def test_a_study_of_another_preset_is_asked_about_its_own_images(root: Path, mon
         folder = Paths(root, "quick").model(model)
         folder.mkdir(parents=True)
         shutil.copy(root / "w.safetensors", folder / "weights.safetensors")
-    monkeypatch.setattr(shipped, "measure_weights", lambda name, root, **how: asked.append(how["presets"]) or {})
+    monkeypatch.setattr(study, "measure_weights", lambda name, root, **how: asked.append(how["presets"]) or {})
     rows = measure_study("robustness", root, quick, steps=7)
     assert list(rows) == [f"cloth-{name}" for name in ("mmgsd", "mmgsd_workspace", "mmgsd_clutter", "mmgsd_heads")]
     assert set(asked) == {("quick", "workspace_quick")}

@@ -9,7 +9,6 @@ import pandas as pd
 import pytest
 
 from mmgsd.config import METHODS, OBJECTS, PRESETS
-from mmgsd.measure.figure_data import FigureData
 from mmgsd.measure.metrics import PCK_PX, summarise_errors
 from mmgsd.measure.regions import find_regions
 from mmgsd.paths import find_root
@@ -19,6 +18,7 @@ from mmgsd.report.findings import describe_claims
 from mmgsd.report.latex import flatten, make_definitions, write_report
 from mmgsd.report.latex_tables import CLAIMS, NOT_RUN, TABLES, escape, set_text, to_latex
 from mmgsd.report.results import FILES, load_results, measure_places
+from mmgsd.studies.figure_data import FigureData
 
 ROOT = find_root(Path(__file__).parent)
 GROUPS, REGIONS = ("v4", "c4", "d4"), ("corner", "edge", "interior")
@@ -293,7 +293,7 @@ def test_places_are_means_over_visible_queries(tmp_path: Path, monkeypatch: pyte
     points = np.arange(625)
     queries = pd.DataFrame({"point": points, "visible": points != 312, "rmse_px": np.abs(points - 312.0)})
     data = FigureData({"mmgsd": summarise_errors(queries)}, 1.0, {}, [np.zeros((4, 2))])
-    monkeypatch.setattr("mmgsd.measure.figure_data.load_figure_data", lambda path: data)
+    monkeypatch.setattr("mmgsd.studies.figure_data.load_figure_data", lambda path: data)
     rope = measure_places(tmp_path / "figures_rope.safetensors", "rope")
     assert rope["end"] > 250 and rope["middle"] == pytest.approx(31.5, abs=1)  # 1 to 62, without the hidden one
     cloth = measure_places(tmp_path / "figures_cloth.safetensors", "cloth")

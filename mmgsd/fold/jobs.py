@@ -1,0 +1,157 @@
+"""Rollouts' states as files: batches of jobs on Dask, each batch in a child process that runs Blender's physics.
+
+A job is a plain dictionary. Its ``mark`` is a digest of all that decides its state, of an act also of the state that it
+goes on from; the state keeps it, so that a file of another origin never passes for it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from dask.distributed import Client
+
+from mmgsd.checks import check, check_choice, read_count, read_flag
+from mmgsd.cluster import run_tasks
+from mmgsd.files import DamagedFileError, scratch_folder, set_aside, write_bytes
+from mmgsd.fold.state import State, read_state
+from mmgsd.fold.tasks import GROUNDS, STARTS, Move, Task, find_task, place_truth
+from mmgsd.progress import ProgressBar
+from mmgsd.scene.stage import connect, run_job
+
+__all__ = ["State", "act_job", "demonstration_job", "look_job", "read_state", "run_jobs", "start_job", "true_moves"]
+
+VERSION = 1  # to be raised where the same job gives another state than before
+JOBS_A_BATCH = 12  # a child process ends after so many at most: it takes seconds to start
+
+PixelMove = tuple[tuple[float, float], tuple[float, float]]  # pick and place, (x, y) px each
+
+
+# Jobs. --------------------------------------------------------------------------------------------------------------
+
+
+def start_job(task: Task, start: str, ground: str, seed: int) -> dict:
+    """A rollout's first state: the object lies in ``start``, turned by any angle, seen by a random camera.
+
+    How it lies depends on task, start and seed alone, what it looks like on the ground too. ValueError for a start that
+    the task's object has not, or another ground than those of ``GROUNDS``.
+    """
+    check_choice("start", start, STARTS[task.object])
+    check_choice("ground", ground, GROUNDS)
+    return _marked(_describe("start", task, start, ground, seed))
+
+
+def demonstration_job(task: Task, seed: int) -> dict:
+    """The demonstration's first state: plain ground, the camera above, the object unturned about the origin."""
+    return _marked(_describe("demonstration", task, task.demonstrated_from, "plain", seed))
+
+
+def act_job(state: Path, moves: Sequence[PixelMove]) -> dict:
+    """The state after ``moves`` made at once from the state in a file: picks and places as pixels (x, y) of its image.
+
+    DamagedFileError where the file is no state; ValueError where moves are no pairs of finite pixels.
+    """
+    pixels = np.array(moves, dtype=float).reshape(-1, 4) if len(moves) == 0 else np.array(moves, dtype=float)
+    accepted = "pairs of finite pixels ((x, y), (x, y))"
+    check("moves", moves, accepted, pixels.shape[1:] in ((2, 2), (4,)) and bool(np.isfinite(pixels).all()))
+    job = {"kind": "act", "after": read_state(state).about["mark"], "moves": pixels.reshape(-1, 2, 2).tolist()}
+    return _marked(job) | {"state": str(state)}
+
+
+def look_job(state: Path, again: int) -> dict:
+    """The state in a file, seen by another camera, the ``again``-th.
+
+    DamagedFileError where the file is no state; ValueError where ``again`` is not at least 1.
+    """
+    check("again", again, "at least 1", read_count("again", again) >= 1)
+    job = {"kind": "look", "after": read_state(state).about["mark"], "again": int(again)}
+    return _marked(job) | {"state": str(state)}
+
+
+def true_moves(look: Sequence[Move], demonstrated: np.ndarray, state: State) -> list[PixelMove]:
+    """What a policy that knows the true matches answers: the pixels of the picked points, and of the carried places.
+
+    Places are carried by the rigid motion that best maps the points (625, 3) m of the demonstration's FIRST state
+    onto those of the rollout's, since a task's places are given in that frame.
+    """
+    places = place_truth(np.array([move.place for move in look]), demonstrated, state.first)
+    pixels = state.project(np.column_stack([places, np.zeros(len(places))]))
+    return [(tuple(map(float, state.xy[move.pick])), (float(x), float(y)))
+            for move, (x, y) in zip(look, pixels, strict=True)]  # fmt: skip
+
+
+def _describe(kind: str, task: Task, start: str, ground: str, seed: int) -> dict:
+    find_task(task.name)
+    what = {"kind": kind, "task": task.name, "object": task.object, "start": start, "ground": ground}
+    return what | {"seed": read_count("seed", seed)}
+
+
+def _marked(job: dict) -> dict:
+    return job | {"mark": hashlib.sha256(json.dumps([VERSION, job], sort_keys=True).encode()).hexdigest()}
+
+
+# Running them. ------------------------------------------------------------------------------------------------------
+
+
+def run_jobs(
+    jobs: Mapping[str, dict], folder: Path, *, workers: int = 0, scheduler: str = "", progress: bool = True
+) -> dict[str, Path]:
+    """Make each job's state, the file ``folder/<name>.npz``; returns the files by name.
+
+    Whole ones that are there already are kept; damaged ones are set aside, those of another job replaced. An act's
+    state must be there. ``workers`` child processes at once (0: one a core), or the ``scheduler`` of an existing Dask
+    cluster by its address. RenderError where a child process fails.
+    """
+    folder, workers, progress = Path(folder), read_count("workers", workers), read_flag("progress", progress)
+    files = {name: folder / f"{name}.npz" for name in jobs}
+    missing = {name: job for name, job in jobs.items() if not _is_whole(files[name], job)}
+    if missing:
+        with connect(workers, scheduler) as client:
+            _run_missing(client, missing, files, progress)
+    return files
+
+
+def _is_whole(path: Path, job: dict) -> bool:
+    """Whether a job's state is there; a damaged one is set aside, another job's will be replaced."""
+    if not path.is_file():
+        return False
+    try:
+        return read_state(path).about["mark"] == job["mark"]
+    except DamagedFileError:
+        set_aside(path)
+        return False
+
+
+def _run_missing(client: Client, jobs: dict[str, dict], files: dict[str, Path], progress: bool) -> None:
+    names = list(jobs)
+    threads = max(1, sum(client.nthreads().values()))
+    size = min(JOBS_A_BATCH, -(-len(names) // threads))
+    batches = [names[i : i + size] for i in range(0, len(names), size)]
+    tasks = {batch[0]: {name: _pack(jobs[name]) for name in batch} for batch in batches}
+    bar = ProgressBar(total=len(names), desc="fold", unit="state", disable=not progress)
+    with bar, run_tasks(client, _make_batch, tasks, retries=1) as results:
+        for _, made in results:
+            for name, data in made.items():
+                write_bytes(files[name], data)
+            bar.update(len(made))
+
+
+def _pack(job: dict) -> tuple[dict, bytes]:
+    """A job, and the file of the state that it goes on from: a worker elsewhere sees no files of this machine."""
+    return job, Path(job["state"]).read_bytes() if "state" in job else b""
+
+
+def _make_batch(jobs: dict[str, tuple[dict, bytes]]) -> dict[str, bytes]:
+    """Make states in a child process: their files by name."""
+    with scratch_folder(Path(tempfile.gettempdir()), "mmgsd-fold") as folder:
+        states = []
+        for i, (job, before) in enumerate(jobs.values()):
+            state = write_bytes(folder / f"before{i}.npz", before) if before else ""
+            states.append(job | {"state": str(state), "out": str(folder / f"after{i}.npz")})
+        outs = [Path(one["out"]) for one in states]
+        what = f"folding {', '.join(jobs)}"
+        return dict(zip(jobs, run_job({"states": states}, folder, what, outs, module="mmgsd.fold"), strict=True))

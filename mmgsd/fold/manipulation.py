@@ -1,0 +1,344 @@
+"""Cloths and ropes under grippers: a first state, then grasps by the camera's rays, physics, and another look.
+
+A gripper comes down at a pixel. Inside the silhouette it pinches the layer that the ray hits first. Near the rim one
+finger slides under the object, and it closes on all layers there. It lays them down where the other pixel's ray meets
+the table. Appearance (camera, ground, light, materials) is drawn from a rollout's seed and its first state, so that all
+its looks share it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+from mathutils import Vector
+from mathutils.bvhtree import BVHTree
+from scipy.ndimage import binary_dilation
+
+from mmgsd.config import IMAGE_SIZE
+from mmgsd.fold.state import State, read_state, write_state
+from mmgsd.fold.tasks import Task, find_task
+from mmgsd.scene import blender, randomize
+from mmgsd.scene.blender import Camera, DeformedObject
+from mmgsd.scene.episode import FLOOR
+from mmgsd.scene.geometry import find_middle, spin
+from mmgsd.scene.objects import cloth, rope
+from mmgsd.scene.objects.meshes import SPACING
+from mmgsd.scene.objects.rope_shape import LENGTH, OwnPart, RopeShape, sample_rope
+from mmgsd.scene.rope_pull import pull_rope
+from mmgsd.scene.workspace.distractors import add_distractors
+from mmgsd.scene.workspace.materials import paint_object
+from mmgsd.scene.workspace.surfaces import Site, add_surfaces
+from mmgsd.scene.workspace.view import draw_light, frame_points, sample_ground_points
+
+SAMPLES = 1  # of Cycles, a pixel, as the rendered sets have
+MAX_OFFSET = 0.1  # m from the origin, along x and y, of a first state
+MAX_TILT_DEG = 30.0
+FLIP = (0.3, 0.45)  # m along x and y that the start "corner" flips its corner over; a demonstration the mean
+SLENDERNESS = (32, 50)  # of a rope: its length in diameters
+FINGER = 0.1  # m: so far a gripper reaches under the object from its rim
+GRIP = 0.02  # m around a pick, in which layers are taken; below the distance of two vertices
+LEAST_FRAMES, FRAMES_A_METRE = 12, 30  # of a move: a faster one swings the cloth beyond its aim
+SETTLE_FRAMES = 12
+LIFT = 0.35  # height of a cloth's arc over its length: with a half circle's 0.5 the cloth is pulled along
+FRICTION = 80.0  # of the table: what lies on it must not be dragged along by what is lifted
+LAID_AT = 0.03  # m above the table, where grippers let go of a cloth
+MAX_STRETCH = 1.35  # of a rope, and of the 99th percentile of a cloth's edges: four layers in grippers reach 1.2
+LEAST_SEEN = 0.8  # share of the material points in the picture
+
+Moves = Sequence[tuple[Sequence[float], Sequence[float]]]  # pick (x, y) and place (x, y), px
+
+
+def run_job(job: dict[str, Any], out: Path) -> Path:
+    """Make the state of a job of `mmgsd.fold.jobs` and write it to ``out``; ValueError for an unknown task."""
+    if job["kind"] == "act":
+        return write_state(out, act(read_state(job["state"]), job["moves"], job["mark"]))
+    if job["kind"] == "look":
+        return write_state(out, look_again(read_state(job["state"]), job["again"], job["mark"]))
+    return write_state(out, begin(job))
+
+
+# First states. ------------------------------------------------------------------------------------------------------
+
+
+def begin(job: dict[str, Any]) -> State:
+    """The first look of a rollout, or of the demonstration: the latter unturned about the origin, seen from above."""
+    task = find_task(job["task"])
+    about = {key: job[key] for key in ("object", "task", "start", "ground", "seed", "mark")}
+    about |= {"demonstration": job["kind"] == "demonstration", "look": 0, "fault": "", "thickness": 0.0}
+    rng = _stream(about, "shape")
+    if task.object == "cloth":
+        vertices = _begin_cloth(rng, about)
+    else:
+        vertices, about["thickness"] = _begin_rope(rng, about)
+    if not about["demonstration"]:
+        vertices = _turn(rng, vertices)
+    return _look(vertices.astype(np.float32), None, about)
+
+
+def _stream(about: dict[str, Any], purpose: str) -> np.random.Generator:
+    """Random numbers for one purpose; how the object lies does not depend on the ground, a pair's other half."""
+    words = [about["task"], about["start"], purpose]
+    if purpose in ("camera", "look"):
+        words += [about["ground"]]
+    if purpose == "camera" and about.get("again"):
+        words += [str(about["again"])]
+    return np.random.default_rng([about["seed"], int(about["demonstration"]), zlib.crc32(" ".join(words).encode())])
+
+
+def _begin_cloth(rng: np.random.Generator, about: dict[str, Any]) -> np.ndarray:
+    if about["start"] != "corner":
+        return cloth.deform(rng, about["start"])[0]
+    vertices, _ = cloth.deform(rng, "flat")
+    shift = np.full(2, np.mean(FLIP)) if about["demonstration"] else rng.uniform(*FLIP, size=2)
+    corner = int(cloth.SIDE + 1)  # one vertex inside the rim, at the first row's beginning
+    return move_cloth(vertices, [([corner], shift * (1, -1))])
+
+
+def _begin_rope(rng: np.random.Generator, about: dict[str, Any]) -> tuple[np.ndarray, float]:
+    """The centre line (625, 3) m about the origin, its ends apart along x, and the rope's diameter (m)."""
+    shape = sample_rope(rng, state=about["start"], slenderness=SLENDERNESS)
+    along = shape.centre[-1, :2] - shape.centre[0, :2]
+    along /= np.linalg.norm(along)
+    centre = shape.centre.copy()
+    centre[:, :2] = centre[:, :2] @ np.array([[along[0], -along[1]], [along[1], along[0]]])
+    centre[:, :2] -= find_middle(centre[:, :2])
+    return centre, shape.thickness
+
+
+def _turn(rng: np.random.Generator, vertices: np.ndarray) -> np.ndarray:
+    """Vertices (V, 3) turned about z by any angle, and a little aside."""
+    turned = vertices @ spin(rng.uniform(0, 2 * np.pi)).T
+    turned[:, :2] += rng.uniform(-MAX_OFFSET, MAX_OFFSET, size=2)
+    return turned
+
+
+# Acts. --------------------------------------------------------------------------------------------------------------
+
+
+def act(state: State, moves: Moves, job_hash: str) -> State:
+    """The next look, after all ``moves`` (px) were made at once.
+
+    A ray that misses the object grasps nothing. What physics spoils is said in the new state's ``fault``; a state that
+    has one already stays as it is.
+    """
+    about = state.about | {"look": state.about["look"] + 1, "mark": job_hash}
+    if about["fault"]:
+        return dataclasses.replace(state, about=about)
+    camera = Camera(state.intrinsics, state.camera_pose, state.mask.shape[::-1])
+    before = state.vertices.astype(float)
+    if about["object"] == "cloth":
+        after = move_cloth(before, _grasp_cloth(before, camera, moves))
+        fault = find_cloth_fault(after)
+    else:
+        after = pull_rope(before, about["thickness"], _grasp_rope(before, about["thickness"], camera, moves))
+        fault = find_rope_fault(after)
+    if not np.isfinite(after).all():
+        after = before
+    elif not fault and camera.contains(camera.project(after)).mean() < LEAST_SEEN:
+        fault = f"less than {LEAST_SEEN:.0%} of it in the picture"
+    return _look(after.astype(np.float32), state.first, about | {"fault": fault})
+
+
+def find_cloth_fault(vertices: np.ndarray) -> str:
+    """What physics did to a cloth (V, 3) m that no cloth would bear; empty where nothing."""
+    if not np.isfinite(vertices).all():
+        return "nowhere"
+    return _find_stretch(cloth.measure_stretch(cloth.square_cloth(), vertices))
+
+
+def find_rope_fault(centre: np.ndarray) -> str:
+    """What was done to a rope (625, 3) m that no rope would bear; empty where nothing."""
+    if not np.isfinite(centre).all():
+        return "nowhere"
+    return _find_stretch(np.linalg.norm(np.diff(centre, axis=0), axis=1).sum() / LENGTH)
+
+
+def _find_stretch(share: float) -> str:
+    return f"stretched to more than {MAX_STRETCH:g} of its length" if share > MAX_STRETCH else ""
+
+
+def move_cloth(vertices: np.ndarray, grasps: Sequence[tuple[Sequence[int], np.ndarray]]) -> np.ndarray:
+    """Vertices (1369, 3) m after groups of them, as (indices, shift (2,) m), were carried at once, let go and settled.
+
+    No grasp changes nothing. Physics may return vertices that are not finite.
+    """
+    if not grasps:
+        return vertices
+    planar = cloth.square_cloth()
+    furthest = max(np.linalg.norm(shift) for _, shift in grasps)
+    frames, grasped = LEAST_FRAMES + int(FRAMES_A_METRE * furthest), {}
+    for group, shift in grasps:
+        lift, low = max(0.05, LIFT * np.linalg.norm(shift)), vertices[group, 2].min()
+        path = cloth.arc_path(np.append(shift, LAID_AT - low), lift, frames)
+        grasped |= {vertex: cloth.Grasp(vertex, path) for vertex in group if vertex not in grasped}
+    carried = cloth.simulate(planar, vertices, list(grasped.values()), frames, friction=FRICTION)
+    if not np.isfinite(carried).all():
+        return carried
+    return cloth.simulate(planar, carried, [], SETTLE_FRAMES, friction=FRICTION)
+
+
+def _grasp_cloth(vertices: np.ndarray, camera: Camera, moves: Moves) -> list[tuple[list[int], np.ndarray]]:
+    """Vertices that each gripper takes, and by what shift (2,) m it carries them; none where its ray misses."""
+    lying = vertices + (0, 0, 0.001 - vertices[:, 2].min())  # as it is rendered
+    faces, grasps = cloth.square_cloth().faces, []
+    tree = BVHTree.FromPolygons(lying.tolist(), faces.tolist())
+    for pick, place in moves:
+        hit, _, face, _ = tree.ray_cast(Vector(camera.pose[:3, 3]), Vector(cast_ray(camera, pick)))
+        target = meet_table(camera, place)
+        if hit is None or target is None:
+            continue
+        corners = faces[face]
+        vertex = int(corners[np.argmin(np.linalg.norm(lying[corners] - np.array(hit), axis=1))])
+        grasps.append((take_layers(lying, vertex), target - np.array(hit)[:2]))
+    return grasps
+
+
+def take_layers(vertices: np.ndarray, vertex: int) -> list[int]:
+    """Vertices that a gripper at ``vertex`` of a cloth (V, 3) m closes on: all layers near the rim, else that one."""
+    place = vertices[vertex, :2]
+    angles = np.linspace(0, 2 * np.pi, 16, endpoint=False)
+    around = place + FINGER * np.stack([np.cos(angles), np.sin(angles)], axis=1)  # (16, 2)
+    gaps = np.linalg.norm(vertices[None, :, :2] - around[:, None], axis=-1).min(axis=1)
+    if gaps.max() < 0.9 * SPACING:  # cloth all around
+        return [vertex]
+    return [vertex, *(int(i) for i in np.flatnonzero(np.linalg.norm(vertices[:, :2] - place, axis=1) < GRIP)
+                      if i != vertex)]  # fmt: skip
+
+
+def _grasp_rope(centre: np.ndarray, thickness: float, camera: Camera, moves: Moves) -> list[tuple[int, np.ndarray]]:
+    """Points of the centre line that grippers take, and by what shift (2,) m; none where a ray misses the rope."""
+    grasps = []
+    for pick, place in moves:
+        offset, ray, target = centre - camera.pose[:3, 3], cast_ray(camera, pick), meet_table(camera, place)
+        depth = offset @ ray
+        aside = np.linalg.norm(offset - depth[:, None] * ray, axis=1)
+        hit = np.flatnonzero(aside < thickness / 2)
+        if not len(hit) or target is None:
+            continue
+        top = hit[depth[hit] < depth[hit].min() + thickness / 2]
+        index = int(top[np.argmin(aside[top])])
+        if index not in [taken for taken, _ in grasps]:
+            grasps.append((index, target - centre[index, :2]))
+    return grasps
+
+
+def cast_ray(camera: Camera, xy: Sequence[float]) -> np.ndarray:
+    """Unit vector (3,), world, from the camera through a pixel (x, y)."""
+    ray = camera.pose[:3, :3] @ np.linalg.solve(camera.intrinsics, [*xy, 1.0])
+    return ray / np.linalg.norm(ray)
+
+
+def meet_table(camera: Camera, xy: Sequence[float]) -> np.ndarray | None:
+    """Where (2,) m a pixel's ray meets the table; None for a ray that does not."""
+    eye, ray = camera.pose[:3, 3], cast_ray(camera, xy)
+    return None if ray[2] > -1e-3 else eye[:2] - ray[:2] * (eye[2] / ray[2])
+
+
+# Looks. -------------------------------------------------------------------------------------------------------------
+
+
+def look_again(state: State, again: int, job_hash: str) -> State:
+    """The same state, seen by the camera of another number than the rollout's own, which is 0; at rest meanwhile."""
+    about = state.about | {"again": again, "mark": job_hash}
+    if about["fault"]:
+        return dataclasses.replace(state, about=about)
+    return _look(state.vertices, state.first, about)
+
+
+def _look(vertices: np.ndarray, first: np.ndarray | None, about: dict[str, Any]) -> State:
+    """Render and label the object; ``first`` (625, 3) m are the points of the rollout's first look, None for that."""
+    scene = blender.reset_scene()
+    deformed = _add_object(vertices.astype(float), about)
+    points = deformed.points.astype(np.float32)
+    first = points if first is None else first
+    room = find_room(first.astype(float), find_task(about["task"]))
+    camera, turn = _draw_camera(room, about)
+    blender.setup_cycles(scene, camera.size, SAMPLES)
+    blender.place_camera(scene, camera)
+    visible = blender.find_visible(deformed, blender.build_bvh(deformed.mesh), camera)
+    image, mask = _render(scene, deformed, room, camera, turn, about)
+    xy = camera.project(deformed.points).astype(np.float32)
+    visible &= _is_near(mask, xy)  # a thing may stand before it
+    return State(vertices, points, image, mask, xy, visible, camera.intrinsics, camera.pose, first, about)
+
+
+def _add_object(vertices: np.ndarray, about: dict[str, Any]) -> DeformedObject:
+    if about["object"] == "cloth":
+        return cloth.add_cloth(vertices, {})
+    thickness = about["thickness"]
+    shape = RopeShape(vertices, thickness, about["start"], np.empty((0, 2), dtype=int), 0.0)
+    mesh = rope.add_parts(rope.build_parts(shape, rope.draw_lay(_stream(about, "lay"))))
+    return DeformedObject(mesh, vertices, thickness, {}, OwnPart(vertices, rope.OWN_ARC * thickness))
+
+
+def find_room(points: np.ndarray, task: Task) -> np.ndarray:
+    """Places (K, 3) m that a task may need, around its object's first points (625, 3) m: seen, and nothing on them."""
+    middle = np.append(find_middle(points[:, :2]), 0.0)
+    if task.name == "straighten":  # the rope may come to lie in any direction
+        angle = np.linspace(0, 2 * np.pi, 64, endpoint=False)
+        rings = [np.stack([r * np.cos(angle), r * np.sin(angle), 0 * angle], axis=1) for r in (0.85, 0.6, 0.3)]
+        return np.concatenate([points, *(middle + ring for ring in rings)])
+    mirrored = points * (-1, -1, 1) + 2 * middle
+    if task.object == "cloth":
+        return np.concatenate([points, mirrored])
+    beside = [points + np.array([x, y, 0]) for x, y in ((0.2, 0), (-0.2, 0), (0, 0.2), (0, -0.2))]
+    return np.concatenate([points, mirrored, *beside])
+
+
+def _draw_camera(room: np.ndarray, about: dict[str, Any]) -> tuple[Camera, float]:
+    """A camera that sees the whole room, and its turn (rad) about z."""
+    rng, size = _stream(about, "camera"), IMAGE_SIZE[about["object"]]
+    if about["demonstration"]:
+        return frame_points(rng, room, size, 0.0, 0.0, 0.85, 3.0, shift=0.0), 0.0
+    if about["ground"] == "plain":
+        camera, turn = randomize.draw_camera(rng, room, size, 180.0)
+        return camera, float(np.radians(turn))
+    turn, tilt = rng.uniform(-np.pi, np.pi), rng.uniform(0, MAX_TILT_DEG)
+    return frame_points(rng, room, size, turn, tilt, rng.uniform(0.7, 0.95), rng.uniform(1.2, 3.0)), turn
+
+
+def _render(
+    scene: bpy.types.Scene, deformed: DeformedObject, room: np.ndarray, camera: Camera, turn: float,
+    about: dict[str, Any],
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Ground, light and materials of the rollout: image (H, W, 3) uint8, mask (H, W) bool."""
+    rng, masked = _stream(about, "look"), None
+    if about["ground"] == "plain":
+        randomize.draw_light(rng, scene)
+        colour, _ = randomize.draw_background(rng, blender.add_floor("floor", FLOOR))
+        randomize.draw_object_material(rng, deformed.mesh, colour)
+    else:
+        masked = _furnish(rng, scene, deformed, room, camera, turn, about)
+    image, mask = blender.render_image(scene, seed=int(rng.integers(2**31)))
+    if masked is not None:
+        image[~mask] = masked
+    return image, mask
+
+
+def _furnish(
+    rng: np.random.Generator, scene: bpy.types.Scene, deformed: DeformedObject, room: np.ndarray, camera: Camera,
+    turn: float, about: dict[str, Any],
+) -> tuple[int, int, int] | None:  # fmt: skip
+    """A workspace around the room, nothing on it; where somebody has masked the picture, the mask's colour."""
+    colour, _ = paint_object(rng, deformed.mesh)
+    slender = about["object"] == "rope"
+    side = float(np.ptp(room[:, :2], axis=0).max()) if slender else cloth.EXTENT
+    site = Site(room, side, turn, sample_ground_points(rng, camera), colour, about["thickness"] / 2, slender)
+    _, walls, masked = add_surfaces(rng, site)
+    free = np.ones(len(room), dtype=bool)
+    add_distractors(rng, site, camera, free, beside=masked is None, walls=walls, over=False)
+    draw_light(rng, scene, side, np.append(site.middle, 0.0))
+    return masked
+
+
+def _is_near(mask: np.ndarray, xy: np.ndarray) -> np.ndarray:
+    """Which pixels (N, 2) lie in the mask (H, W) or beside it: (N,) bool."""
+    height, width = mask.shape
+    x, y = np.clip(np.rint(xy), 0, (width - 1, height - 1)).astype(int).T
+    return binary_dilation(mask, iterations=2)[y, x]

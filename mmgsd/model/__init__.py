@@ -1,0 +1,1 @@
+"""The network, its heads and calibration, and the files that hold them."""

@@ -1,0 +1,1 @@
+"""The studies: what is trained and asked, and what comes of it."""

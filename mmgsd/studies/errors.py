@@ -1,0 +1,172 @@
+"""Where a model's error sits: against occlusion, the objects' states, the distance to the border and to a fold."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from scipy.ndimage import distance_transform_cdt
+
+from mmgsd.dataset import Dataset
+from mmgsd.figures.style import (
+    MARK,
+    MODE,
+    PAGE_IN,
+    TRUE,
+    blend_heatmap,
+    check_filled,
+    draw_modes,
+    finish_axes,
+    make_grid,
+    mark_pixel,
+    mark_true,
+    styled,
+)
+from mmgsd.match.match import Match
+from mmgsd.studies.models import get_colour
+
+FEW_PAIRS = 5  # of images: their mean says as much of them as of their states
+QUESTIONS = {
+    "hidden": ("hidden\nmatches", [0, 1, 2, 3, 4, 5]),
+    "seen_target": ("visible share\nof target", [0, 0.4, 0.6, 0.8, 0.95, 1.01]),
+    "border": ("points to\nthe border", [0, 1, 3, 6, 9, 13]),
+    "covered": ("points to\na hidden one", [1, 2, 4, 8, 16, 1000]),
+}
+LENGTHS = {"border": [0, 16, 48, 96, 160, 313], "covered": [1, 4, 16, 48, 96, 1000]}  # the same along a rope
+
+
+def describe_queries(queries: pd.DataFrame, data: Dataset) -> pd.DataFrame:
+    """The queries with a visible source, each with what may explain its error.
+
+    ``state0``, ``state1`` of source and target; ``seen_target``, the visible share of the target's points; ``border``,
+    material points from the source point to the object's border or end; ``covered``, to the nearest hidden point.
+    """
+    table = queries[queries.visible].copy()
+    states = data.labels.state.to_numpy()
+    table["state0"], table["state1"] = states[table.image0], states[table.image1]
+    table["seen_target"] = data.visible.mean(1)[table.image1]
+    shape = (25, 25) if data.object == "cloth" else (data.n_points,)
+    inside = np.pad(np.ones(shape, np.uint8), 1)
+    border = distance_transform_cdt(inside, "chessboard")[(slice(1, -1),) * len(shape)].ravel() - 1
+    covered = np.stack([_measure_covered(seen.reshape(shape)) for seen in data.visible])
+    return table.assign(border=border[table.point], covered=covered[table.image0, table.point])
+
+
+def _measure_covered(seen: np.ndarray) -> np.ndarray:
+    """Material points from each one to the nearest hidden one; 999 where all are seen."""
+    if seen.all():
+        return np.full(seen.size, 999)
+    return distance_transform_cdt(seen.astype(np.uint8), "chessboard").ravel()
+
+
+def summarise_states(described: pd.DataFrame) -> pd.DataFrame:
+    """Mean ``rmse_px`` by the states of source (rows) and target (columns)."""
+    return described.pivot_table("rmse_px", "state0", "state1", observed=True)
+
+
+def summarise_entropy(described: pd.DataFrame) -> dict[str, float]:
+    """Mean entropy (nats): ``seen`` and ``hidden``, of queries with every and with not every match seen; by target."""
+    kinds = described.hidden.gt(0).map({False: "seen", True: "hidden"})
+    means = [described.groupby(key, observed=True).entropy.mean() for key in (kinds, "state1")]
+    return {str(kind): round(float(mean), 3) for kind, mean in pd.concat(means).items()}
+
+
+@styled
+def plot_error_analysis(tables: Mapping[str, pd.DataFrame]) -> Figure:
+    """A row an object ({object: `describe_queries`}): mean RMSE by states, and against what may explain it.
+
+    In brackets where fewer than ``FEW_PAIRS`` pairs of images have these states.
+    """
+    check_filled("tables", tables)
+    figure, axes = plt.subplots(len(tables), 1 + len(QUESTIONS), figsize=(PAGE_IN, 2.1 * len(tables)), squeeze=False,
+                                layout="constrained", width_ratios=[1.5] + [1] * len(QUESTIONS))  # fmt: skip
+    for line, (name, table) in zip(axes, tables.items(), strict=True):
+        _draw_states(line[0], table, name)
+        for axis, (column, (label, edges)) in zip(line[1:], QUESTIONS.items(), strict=True):
+            _draw_bins(axis, table, column, edges if name == "cloth" else LENGTHS.get(column, edges))
+            axis.set(xlabel=label, ylim=(0, None))
+        line[1].set_ylabel("RMSE (px)")
+    return finish_axes(figure, keep_box=axes[:, 0].tolist())
+
+
+def _draw_states(axis: Axes, table: pd.DataFrame, name: str) -> None:
+    means = summarise_states(table)
+    pairs = table.pivot_table("pair", "state0", "state1", aggfunc="nunique", observed=True).to_numpy()
+    axis.imshow(means, cmap="viridis", vmin=0)
+    middle = np.nanmax(means) / 2
+    for row, column in np.argwhere(pairs > 0):  # NaN where no pair has these states
+        value = means.iloc[row, column]
+        text = f"({value:.0f})" if pairs[row, column] < FEW_PAIRS else f"{value:.0f}"
+        axis.text(column, row, text, ha="center", va="center", fontsize=6, c="w" if value < middle else "k")
+    axis.set(xticks=range(means.shape[1]), yticks=range(means.shape[0]), title=f"{name.capitalize()}: RMSE (px)")
+    axis.set(ylabel="source", xlabel="target")
+    axis.set_xticklabels(means.columns, rotation=40, ha="right")
+    axis.set_yticklabels(means.index)
+
+
+def _draw_bins(axis: Axes, table: pd.DataFrame, column: str, edges: Sequence[float]) -> None:
+    groups = table.groupby(pd.cut(table[column], edges, right=False), observed=True).rmse_px
+    means, shares = groups.mean(), groups.size() / len(table)
+    axis.bar(range(len(means)), means, color=get_colour("mmgsd"), width=0.75)
+    for k, share in enumerate(shares):
+        axis.text(k, 0, f" {100 * share:.0f} %", ha="center", va="bottom", fontsize=5.5, c="w", rotation=90)
+    whole = all(float(e).is_integer() for e in edges)
+    labels = [_name_bin(i.left, i.right - 1) if whole else f"{i.left:g}–{min(i.right, 1):g}" for i in means.index]
+    axis.set_xticks(range(len(means)), labels, rotation=40, ha="right")
+
+
+def _name_bin(first: float, last: float) -> str:
+    if last > 900:
+        return f"{first:g}+"
+    return f"{first:g}" if first == last else f"{first:g}–{last:g}"
+
+
+def choose_worst(described: pd.DataFrame, count: int = 24) -> pd.DataFrame:
+    """The ``count`` queries with the greatest error, at most one of each pair of images, the worst first."""
+    return described.sort_values("rmse_px", ascending=False).drop_duplicates("pair").head(count)
+
+
+def plot_worst_queries(described: pd.DataFrame, data: Dataset, matcher: Any, *, count: int = 24) -> Figure:
+    """`plot_worst` of the queries of `choose_worst`, asked anew: a table of answers holds no heatmaps."""
+    rows, orbits = choose_worst(described, count), data.group()
+    matches = [
+        matcher.match(*map(data.load_image, (row.image0, row.image1)), data.xy[row.image0, [row.point]], n=int(row.n))
+        for row in rows.itertuples()
+    ]
+    true = [data.xy[row.image1][orbits.distinct_modes(row.point)] for row in rows.itertuples()]
+    return plot_worst(matches, true, rows.rmse_px.tolist())
+
+
+@styled
+def plot_worst(matches: Sequence[Match], true: Sequence[np.ndarray], errors_px: Sequence[float]) -> Figure:
+    """Source and target of each query side by side: the heatmap, the modes, and the ``true`` (n, 2) px as crosses.
+
+    A legend says what the signs are.
+    """
+    check_filled("matches", matches)
+    columns, sheet = 4, [np.hstack([m.image0, m.image1]) for m in matches]
+    aspect = sheet[0].shape[0] / sheet[0].shape[1]
+    figure, axes = make_grid([aspect] * -(-len(matches) // columns), columns, PAGE_IN)
+    for axis, match, xy, error in zip(axes.flat, matches, true, errors_px, strict=False):
+        (height, width), left = match.image1.shape[:2], match.image0.shape[1]
+        axis.imshow(match.image0, extent=(-0.5 - left, -0.5, height - 0.5, -0.5))
+        blended = blend_heatmap(match.image1, match.compute_heatmap())
+        axis.imshow(blended, extent=(-0.5, width - 0.5, height - 0.5, -0.5))
+        axis.set(xlim=(-0.5 - left, width - 0.5), ylim=(height - 0.5, -0.5))
+        mark_pixel(axis, match.xy[0, 0] - left, match.xy[0, 1])
+        draw_modes(axis, match, 0)
+        mark_true(axis, xy)
+        axis.set_title(f"{error:.0f} px", fontsize=6)
+    for axis in axes.flat[len(matches) :]:
+        axis.remove()
+    signs = {"asked pixel": ("o", MARK, "black"), "mode": ("o", "none", MODE), "true match": ("x", TRUE, TRUE)}
+    handles = [Line2D([], [], ls="", marker=m, mfc=face, mec=edge, ms=5, label=label)
+               for label, (m, face, edge) in signs.items()]  # fmt: skip
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(signs), fontsize=6)
+    return figure

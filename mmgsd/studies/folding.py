@@ -1,0 +1,399 @@
+"""The bench: rollouts of every policy from the same first states, as files, and what came of them.
+
+    python -m mmgsd.studies.folding quick         -> data/results/quick/folding.json, figures/quick/folding*
+    python -m mmgsd.studies.folding quick --only mmgsd       those policies whose name holds that text
+    python -m mmgsd.studies.folding quick --trained          the four methods as the preset quick trains them
+    python -m mmgsd.studies.folding demonstrations           -> data/demonstrations, what policies are shown
+
+All go in step: first states, every policy's answers, what physics makes of them, the next look. A killed run goes on.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib import pyplot as plt
+from matplotlib.figure import Figure
+
+from mmgsd.checks import check_choice
+from mmgsd.command import run_command
+from mmgsd.config import DEFAULT_GROUP, OBJECTS
+from mmgsd.figures.folding import mark_moves, mark_success, plot_rollouts, save_slides
+from mmgsd.figures.style import PAGE_IN, check_filled, finish_axes, save_figure, styled
+from mmgsd.files import DamagedFileError, read_json, set_aside, write_json
+from mmgsd.fold.agreement import Motion
+from mmgsd.fold.demonstration import Demonstration, Look, write_demonstration
+from mmgsd.fold.jobs import act_job, demonstration_job, look_job, run_jobs, start_job, true_moves
+from mmgsd.fold.measures import SIDES_M, SUCCESS, compare_rollouts, estimate_mean, estimate_share, measure_outcome
+from mmgsd.fold.moves import Answer, choose_moves
+from mmgsd.fold.state import State, read_state
+from mmgsd.fold.tasks import GROUNDS, TASKS, Task, find_task
+from mmgsd.match.camera import compute_rays
+from mmgsd.paths import Paths, find_root
+from mmgsd.progress import ProgressBar
+from mmgsd.studies.policies import POLICIES, SHIPPED, TRAINED_BY, Policy, ask, digest_policy, draw_moves
+from mmgsd.symmetry import load_group
+
+ROLLOUTS = {"smoke": 2, "quick": 36, "paper": 100}  # of each policy and object
+MORE = ("wrinkled", 0.4)  # a start of which few rollouts count, and how many more begin from it, of the count
+DEMONSTRATIONS = "demonstrations"  # instead of a preset: write these alone
+REFERENCE = "mmgsd"  # the policy that the others are compared with, rollout by rollout
+QUALITY = 90  # of the images of demonstrations as files
+AGREES = 0.7  # share of the questions that agree from which a cautious robot acts
+ANCHORS = {"cloth": [25 * r + c for r in (1, 12, 23) for c in (1, 12, 23) if (r, c) != (12, 12)],
+           "rope": [8, 120, 200, 424, 504, 616]}  # fmt: skip  # material points that a demonstration marks besides
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """One first state: which task, from which start, on which ground, with which seed."""
+
+    task: str
+    start: str
+    ground: str
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """What its files are called by."""
+        return f"{self.task}-{self.start.replace(' ', '_')}-{self.ground}-{self.seed}"
+
+
+def list_rollouts(object: str, count: int) -> list[Rollout]:
+    """``count`` rollouts of an object, its tasks, their starts and the grounds in turn; then those of `MORE`."""
+    kinds = [(task.name, start) for task in TASKS.values() if task.object == object for start in task.starts]
+    more = [kind for kind in kinds if kind[1] == MORE[0]]
+    turns = [(kinds, k) for k in range(count)] + [(more, k) for k in range(int(MORE[1] * count) if more else 0)]
+    return [Rollout(*chosen[k % len(chosen)], GROUNDS[k // len(chosen) % len(GROUNDS)], seed)
+            for seed, (chosen, k) in enumerate(turns)]  # fmt: skip
+
+
+def run_folding(
+    preset: str, root: Path, *, policies: Iterable[Policy] = SHIPPED, workers: int = 0,
+    scheduler: str = "", progress: bool = True,
+) -> Path:  # fmt: skip
+    """Run a preset's rollouts of some policies, write what came of them, and draw one of each task; the results' path.
+
+    What is drawn are these policies, where `REFERENCE` is one of them.
+
+    ``workers`` and ``scheduler`` are as `run_jobs` has them.
+
+    Rows of other policies that the results hold stay. ValueError for a preset without rollouts.
+    """
+    check_choice("preset", preset, tuple(ROLLOUTS))
+    paths = Paths(root, preset)
+    bench = Bench(paths.generated / "folding", {"workers": workers, "scheduler": scheduler, "progress": progress})
+    out = paths.results / "folding.json"
+    rows = read_json(out)["policies"] if out.is_file() else {name: {} for name in OBJECTS}
+    policies, pictures, slides = list(policies), {}, []
+    for object in OBJECTS:
+        rollouts = list_rollouts(object, ROLLOUTS[preset])
+        starts = bench.make_starts(rollouts)
+        kept = [rollout for rollout in rollouts if not read_state(starts[rollout]).about["fault"]]
+        found = bench.roll(policies, kept, starts)
+        shown = choose_shown(kept, found.get(REFERENCE, {}))
+        pictures |= bench.list_pictures(policies, shown, starts, found)
+        slides += [pair for policy in policies if policy.name == REFERENCE for pair in bench.list_slides(policy, shown)]
+        untouched = bench.judge_untouched({rollout: starts[rollout] for rollout in kept})
+        done = {name for name, row in untouched.items() if row["success"]}
+        reachable = {key for key, row in found.get("truth", {}).items() if row["success"]} - done
+        rows[object]["nothing"] = summarise_rollouts(untouched, reachable)
+        for policy in policies:
+            rows[object][policy.name] = summarise_rollouts(found[policy.name], reachable)
+        rows[object] = {name: rows[object][name] for name in POLICIES if name in rows[object]}
+        if REFERENCE in rows[object]:
+            ours = rows[object][REFERENCE]["rollouts"]
+            for row in rows[object].values():
+                row["beyond"] = compare_rollouts(ours, row["rollouts"], reachable)
+    if slides:
+        save_figure(plot_rollouts(pictures), paths.figures / "folding", kinds=("jpg",))
+        save_slides(slides, paths.figures / "folding.webp")
+    results = {"run": {"rollouts": ROLLOUTS[preset]}, "policies": rows}
+    if any("reachable" in row for policies_ in rows.values() for row in policies_.values()):
+        save_figure(plot_success(results), paths.figures / "folding_success", kinds=("png",))
+    return write_json(out, results)
+
+
+def write_demonstrations(root: Path, *, workers: int = 0, scheduler: str = "", progress: bool = True) -> list[Path]:
+    """Write what policies are shown of each task as files of the format that a user's demonstrations have; their paths.
+
+    To ``data/demonstrations``, by name of the task. ``workers`` and ``scheduler`` are as `run_jobs` has them.
+    """
+    how = {"workers": workers, "scheduler": scheduler, "progress": progress}
+    bench = Bench(Paths(root, "quick").generated / "folding", how)
+    bench.demonstrate(TASKS.values())
+    folder = root / "data" / "demonstrations"
+    return [write_demonstration(bench.make_demonstration(task), folder / f"{task.name}.json", quality=QUALITY)
+            for task in TASKS.values()]  # fmt: skip
+
+
+class Bench:
+    """The files of a preset's rollouts in a ``folder``; ``how`` is what `run_jobs` is told of workers."""
+
+    def __init__(self, folder: Path, how: Mapping[str, Any]) -> None:
+        self.folder, self.how = Path(folder), dict(how)
+        self.demonstrated: dict[str, list[State]] = {}
+        self.ends: dict[tuple[Policy, Rollout], Path] = {}
+        self.acted: dict[tuple[Policy, Rollout], list[tuple[Path, Answer]]] = {}  # each look, and what was done then
+
+    def make_starts(self, rollouts: list[Rollout]) -> dict[Rollout, Path]:
+        """First states, and before them the states that the rollouts' demonstrations go through."""
+        self.demonstrate({rollout.task: find_task(rollout.task) for rollout in rollouts}.values())
+        jobs = {r.name: start_job(find_task(r.task), r.start, r.ground, r.seed) for r in rollouts}
+        files = run_jobs(jobs, self.folder / "starts", **self.how)
+        return {rollout: files[rollout.name] for rollout in rollouts}
+
+    def demonstrate(self, tasks: Iterable[Task]) -> None:
+        """The states that tasks' demonstrations go through."""
+        for task in tasks:
+            self.demonstrated.setdefault(task.name, self._demonstrate(task))
+
+    def _demonstrate(self, task: Task) -> list[State]:
+        """The states before, between and after a task's looks, each look by its own places."""
+        folder, jobs = self.folder / "demonstrations", {f"{task.name}_0": demonstration_job(task, 0)}
+        states = [run_jobs(jobs, folder, **self.how)[f"{task.name}_0"]]
+        for number, look in enumerate(task.looks, 1):
+            moves = true_moves(look, read_state(states[0]).points, read_state(states[-1]))
+            name = f"{task.name}_{number}"
+            states.append(run_jobs({name: act_job(states[-1], moves)}, folder, **self.how)[name])
+        return [read_state(state) for state in states]
+
+    def make_demonstration(self, task: Task) -> Demonstration:
+        """What a policy is shown of a task: images, picks and places, and anchors where they are seen."""
+        looks = []
+        for moves, state in zip(task.looks, self.demonstrated[task.name], strict=False):
+            pixels = np.array(true_moves(moves, self.demonstrated[task.name][0].points, state), float)
+            anchors = [k for k in ANCHORS[task.object] if state.visible[k] and k not in [move.pick for move in moves]]
+            looks.append(Look(state.image, pixels.reshape(-1, 2, 2), state.xy[anchors].astype(float)))
+        return Demonstration(task.object, tuple(looks))
+
+    def judge_untouched(self, starts: Mapping[Rollout, Path]) -> dict[str, dict[str, Any]]:
+        """{rollout: how it is before anything is done}: who does nothing must not be praised."""
+        return {rollout.name: self._judge(rollout, file, []) for rollout, file in starts.items()}
+
+    def roll(
+        self, policies: list[Policy], rollouts: list[Rollout], starts: dict[Rollout, Path]
+    ) -> dict[str, dict[str, dict[str, Any]]]:
+        """{policy: {rollout: how it ended}} of every policy from every first state."""
+        files = {(policy, rollout): starts[rollout] for policy in policies for rollout in rollouts}
+        answers: dict[tuple[Policy, Rollout], list[Answer]] = {arm: [] for arm in files}
+        for number in range(max(len(find_task(rollout.task).looks) for rollout in rollouts)):
+            going = [arm for arm in files if len(find_task(arm[1].task).looks) > number]
+            for arm in ProgressBar(going, desc="answer", disable=not self.how["progress"], leave=False):
+                answers[arm].append(self._answer(*arm, number, files[arm], answers[arm]))
+            self._look_again(going, number, files, answers)
+            for arm in going:
+                self.acted.setdefault(arm, []).append((files[arm], answers[arm][-1]))
+            names = {arm: f"{arm[0].name}-{arm[1].name}-{number}" for arm in going}
+            jobs = {names[arm]: act_job(files[arm], answers[arm][-1].moves.tolist()) for arm in going}
+            made = run_jobs(jobs, self.folder / "acts", **self.how)
+            files |= {arm: made[name] for arm, name in names.items()}
+        self.ends |= files
+        return {policy.name: {rollout.name: self._judge(rollout, files[policy, rollout], answers[policy, rollout])
+                              for rollout in rollouts} for policy in policies}  # fmt: skip
+
+    def _look_again(
+        self, going: list[tuple[Policy, Rollout]], number: int, files: dict[tuple[Policy, Rollout], Path],
+        answers: dict[tuple[Policy, Rollout], list[Answer]],
+    ) -> None:  # fmt: skip
+        """Put the look and the answer in place that most questions agree in, where a policy looks again if few do."""
+        first = {arm: files[arm] for arm in going}
+        for again in range(1, max(policy.looks for policy, _ in going)):
+            unsure = [arm for arm in going if arm[0].looks > again and answers[arm][-1].share < AGREES]
+            names = {arm: f"{arm[0].name}-{arm[1].name}-{number}-look{again}" for arm in unsure}
+            made = run_jobs({names[arm]: look_job(first[arm], again) for arm in unsure}, self.folder / "acts",
+                            **self.how)  # fmt: skip
+            for arm in unsure:
+                file = made[names[arm]]
+                answer = self._answer(*arm, number, file, answers[arm][:-1], again=again)
+                if answer.share > answers[arm][-1].share:
+                    files[arm], answers[arm][-1] = file, answer
+
+    def list_pictures(
+        self, policies: list[Policy], rollouts: Mapping[str, Rollout], starts: dict[Rollout, Path],
+        found: Mapping[str, Mapping[str, Mapping[str, Any]]],
+    ) -> dict[str, dict[str, np.ndarray]]:  # fmt: skip
+        """{task's label: {what is seen: picture}} of a rollout of each task: demonstration, start, policies' ends.
+
+        ``found`` is as `roll` gives it: the ends are framed by whether they are a success.
+        """
+        rows = {}
+        for task in (task for task in TASKS.values() if task.name in rollouts):
+            shown, rollout = self.demonstrated[task.name], rollouts[task.name]
+            row = {
+                "demonstrated": shown[0].image,
+                "its end": shown[-1].image,
+                "found": read_state(starts[rollout]).image,
+            }
+            seen = [policy for policy in policies if policy.looks == 1]  # what looks again mostly does the same
+            rows[task.label] = row | {
+                policy.label: mark_success(read_state(self.ends[policy, rollout]).image,
+                                           found[policy.name][rollout.name]["success"]) for policy in seen
+            }  # fmt: skip
+        return rows
+
+    def list_slides(self, policy: Policy, rollouts: Mapping[str, Rollout]) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Of a rollout of each task, look by look and at its end: the demonstration's picture and the policy's."""
+        slides = []
+        for task in (task for task in TASKS.values() if task.name in rollouts):
+            shown, arm = self.demonstrated[task.name], (policy, rollouts[task.name])
+            for look, (file, answer) in zip(self.make_demonstration(task).looks, self.acted[arm], strict=True):
+                slides.append((mark_moves(look.image, look.moves), mark_moves(read_state(file).image, answer.moves)))
+            slides.append((shown[-1].image, read_state(self.ends[arm]).image))
+        return slides
+
+    def _answer(
+        self, policy: Policy, rollout: Rollout, number: int, file: Path, before: list[Answer], *, again: int = 0
+    ) -> Answer:
+        """The moves (px) of one look, kept as a file; asked anew where the state or the policy is another."""
+        state, task = read_state(file), find_task(rollout.task)
+        look = f"-look{again}" if again else ""
+        place = self.folder / "answers" / f"{policy.name}-{rollout.name}-{number}{look}.json"
+        mark = {"state": state.about["mark"], "policy": digest_policy(policy, task.object)}
+        kept = _read_answer(place, mark)
+        if kept is None:
+            kept = self._ask(policy, rollout, number, state, before[0].motion if before else None)
+            motion = None if kept.motion is None else _to_list(kept.motion)
+            write_json(place, {"mark": mark, "moves": kept.moves.tolist(), "motion": motion, "share": kept.share})
+        return kept
+
+    def _ask(self, policy: Policy, rollout: Rollout, number: int, state: State, motion: Motion | None) -> Answer:
+        task = find_task(rollout.task)
+        shown = self.demonstrated[task.name]
+        look = self.make_demonstration(task).looks[number]
+        if policy.name == "truth":
+            return Answer(np.array(true_moves(task.looks[number], shown[0].points, state)), None, 1.0)
+        if policy.name == "random":
+            return Answer(draw_moves(look, state.mask, np.random.default_rng([rollout.seed, number])), None, 1.0)
+        match = ask(policy, task.object, look, state.image, state.mask)
+        answer = choose_moves(look, match, policy.chosen, lambda xy: find_on_table(xy, shown[number]),
+                              lambda xy: find_on_table(xy, state), motion=motion)  # fmt: skip
+        moves = answer.moves.reshape(-1, 2)
+        pixels = state.project(np.column_stack([moves, np.zeros(len(moves))])) if len(moves) else moves
+        return Answer(pixels.reshape(-1, 2, 2), answer.motion, answer.share)
+
+    def _judge(self, rollout: Rollout, file: Path, answers: list[Answer]) -> dict[str, Any]:
+        state, task = read_state(file), find_task(rollout.task)
+        group = load_group(task.object, DEFAULT_GROUP[task.object]).permutations
+        end, side = self.demonstrated[task.name][-1].points, SIDES_M[task.object]
+        outcome = measure_outcome(state.points.astype(float), end.astype(float), group, task.object)
+        failed = bool(state.about["fault"])
+        return {"task": task.name, "error": outcome.error_m / side, "overlap": outcome.overlap,
+                "success": not failed and outcome.error_m < SUCCESS * side, "fault": state.about["fault"],
+                "share": min([1.0, *(answer.share for answer in answers)])}  # fmt: skip
+
+
+def choose_shown(rollouts: list[Rollout], ended: Mapping[str, Mapping[str, Any]]) -> dict[str, Rollout]:
+    """{task: the rollout that is drawn}, by rule: of each task the one with the median error where it ``ended``."""
+    tasks: dict[str, list[Rollout]] = {}
+    for rollout in rollouts:
+        tasks.setdefault(rollout.task, []).append(rollout)
+    for found in tasks.values():
+        found.sort(key=lambda rollout: ended[rollout.name]["error"] if rollout.name in ended else 0.0)
+    return {task: found[len(found) // 2] for task, found in tasks.items()}
+
+
+def find_on_table(xy: np.ndarray, state: State) -> np.ndarray:
+    """Where (…, 2) m on the table pixels (…, 2) of a state's image lie; NaN stays NaN."""
+    rays = compute_rays(xy, state.intrinsics) @ state.camera_pose[:3, :3].T
+    eye = state.camera_pose[:3, 3]
+    return eye[:2] - rays[..., :2] * (eye[2] / rays[..., 2:])
+
+
+def summarise_rollouts(rows: dict[str, dict[str, Any]], reachable: set[str]) -> dict[str, Any]:
+    """Errors (share of the side), overlap and success of all rollouts, of those ``reachable``, by task; caution.
+
+    ``reachable`` are the rollouts that the true matches succeed in, and that are no success before anything is done:
+    the others say something of the bench. "cautious": success of those where at least `AGREES` of the questions agree,
+    and how many these are.
+    """
+    groups = {"all": list(rows.values()), "reachable": [row for name, row in rows.items() if name in reachable]}
+    groups |= {task: [row for row in rows.values() if row["task"] == task] for task in TASKS}
+    said = {
+        name: {key: estimate_mean([min(row[key], 1.0) for row in found]) for key in ("error", "overlap")}
+        | {"success": estimate_share([row["success"] for row in found])}
+        for name, found in groups.items()
+        if found
+    }
+    sure = [row["success"] for name, row in rows.items() if row["share"] >= AGREES and name in reachable]
+    each = {name: [round(min(row["error"], 1.0), 4), bool(row["success"])] for name, row in rows.items()}
+    faults = sum(bool(row["fault"]) for row in rows.values())
+    return {**said, "cautious": estimate_share(sure), "faults": faults, "rollouts": each}
+
+
+def _read_answer(path: Path, mark: dict[str, str]) -> Answer | None:
+    """What is kept of the same question; a damaged file is set aside."""
+    if not path.is_file():
+        return None
+    try:
+        kept = read_json(path)
+        if kept["mark"] != mark:
+            return None
+        motion = None if kept["motion"] is None else Motion(*(complex(*pair) for pair in kept["motion"]))
+        return Answer(np.array(kept["moves"], float).reshape(-1, 2, 2), motion, float(kept["share"]))
+    except (DamagedFileError, KeyError, TypeError, ValueError):
+        set_aside(path)
+        return None
+
+
+def _to_list(motion: Motion) -> list[list[float]]:
+    return [[value.real, value.imag] for value in (motion.factor, motion.shift)]
+
+
+@styled
+def plot_success(results: Mapping[str, Any]) -> Figure:
+    """A panel for each object: how often each policy succeeds in the rollouts that count, with 95 % intervals.
+
+    ``results`` as `mmgsd.studies.folding` stores them; a policy that was not measured has no dot. ValueError of none.
+    """
+    rows = results["policies"]
+    names = [name for name in POLICIES if any("reachable" in rows[object].get(name, {}) for object in OBJECTS)]
+    check_filled("results", names)
+    size = PAGE_IN, 0.7 + 0.2 * len(names)
+    figure, axes = plt.subplots(1, len(OBJECTS), figsize=size, layout="constrained", sharey=True)
+    for axis, object in zip(axes, OBJECTS, strict=True):
+        for place, name in enumerate(names):
+            said = rows[object].get(name, {}).get("reachable", {}).get("success")
+            if said:
+                mean, low, high = (100 * said[key] for key in ("mean", "low", "high"))
+                axis.errorbar(mean, place, xerr=[[mean - low], [high - mean]], fmt="o", ms=4, capsize=2,
+                              color=POLICIES[name].colour)  # fmt: skip
+        counted = rows[object].get("truth", {}).get("reachable", {}).get("success", {}).get("count", 0)
+        axis.set(title=f"{object.capitalize()}, {counted} rollouts", xlabel="Success (%)", xlim=(-4, 104))
+    axes[0].set_yticks(range(len(names)), [POLICIES[name].label.replace("`", "") for name in names])
+    axes[0].invert_yaxis()
+    return finish_axes(figure)
+
+
+def main() -> None:
+    """Run the bench of a preset, or write the demonstrations."""
+    parser = argparse.ArgumentParser(prog="python -m mmgsd.studies.folding", description=__doc__.split("\n")[0])
+    parser.add_argument("preset", choices=(*ROLLOUTS, DEMONSTRATIONS))
+    parser.add_argument("--only", default="", help="policies whose name holds this text; their rows alone are written")
+    parser.add_argument("--trained", action="store_true",
+                        help=f"instead the four methods' models that the preset {TRAINED_BY} trained")  # fmt: skip
+    parser.add_argument("--workers", type=int, default=0, help="child processes at once (default: one a core)")
+    parser.add_argument("--scheduler", default="", help="address of a Dask scheduler; none: this machine")
+    args = parser.parse_args()
+    if args.preset == DEMONSTRATIONS:
+        if args.only:
+            parser.error(f"--only {args.only!r} must be given with a preset, got {DEMONSTRATIONS}")
+        how = {"workers": args.workers, "scheduler": args.scheduler}
+        print("\n".join(map(str, write_demonstrations(find_root(), **how))))
+        return
+    asked = [policy for policy in POLICIES.values() if policy.trained] if args.trained else SHIPPED
+    policies = [POLICIES["truth"], *(p for p in asked if args.only in p.name and p.name != "truth")]
+    if not any(args.only in policy.name for policy in asked):
+        parser.error(
+            f"--only {args.only!r}: no policy has a name with that; there are {', '.join(p.name for p in asked)}"
+        )
+    print(run_folding(args.preset, find_root(), policies=policies, workers=args.workers, scheduler=args.scheduler))
+
+
+if __name__ == "__main__":
+    run_command(main, kept="finished states and answers are kept, and the same command goes on")

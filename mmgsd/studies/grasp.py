@@ -1,0 +1,113 @@
+"""Take the corner that you are surest of: one grasp by one pixel's matches, and what it lifts.
+
+    python -m mmgsd.studies.grasp paper    -> data/results/paper/grasp.json
+
+A policy is shown one corner of a flat cloth, and a picture of another cloth; it grasps at one of the four modes,
+carries what it holds to the middle of what it sees, and lets go. A corner is lifted where one then lies within `NEAR`
+of the side of that place. A killed run goes on.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mmgsd.command import run_command
+from mmgsd.config import DEFAULT_GROUP
+from mmgsd.files import write_json
+from mmgsd.fold.jobs import act_job, read_state, run_jobs
+from mmgsd.fold.measures import SIDES_M, estimate_mean, estimate_share
+from mmgsd.fold.state import State
+from mmgsd.fold.tasks import GRASP, GROUNDS
+from mmgsd.match.match import Match
+from mmgsd.match.matcher import Matcher, load
+from mmgsd.paths import Paths, find_root
+from mmgsd.studies.folding import ROLLOUTS, Bench, Rollout, find_on_table
+from mmgsd.symmetry import load_group
+
+MATCHERS = {"mmgsd": "cloth", "mmgsd_paper": "cloth-paper", "spcl": "cloth-spcl"}  # shipped weights that answer
+WAYS = ("surest", "probable", "any")  # the narrowest mode, the most probable one, or one at random
+NEAR = 0.05  # of the side
+CORNERS = load_group(GRASP.object, DEFAULT_GROUP[GRASP.object]).orbit(GRASP.looks[0][0].pick)  # where one was shown
+
+Outcome = dict[str, float | bool]
+
+
+def list_grasps(count: int) -> list[Rollout]:
+    """``count`` rollouts, the starts and the grounds in turn."""
+    starts = GRASP.starts
+    return [Rollout(GRASP.name, starts[k % len(starts)], GROUNDS[k // len(starts) % len(GROUNDS)], k)
+            for k in range(count)]  # fmt: skip
+
+
+def run_grasps(preset: str, root: Path, *, workers: int = 0, progress: bool = True) -> Path:
+    """{matcher: {way: `summarise_grasps`}} of a preset's number of rollouts, as ``grasp.json``; its path."""
+    paths, how = Paths(root, preset), {"workers": workers, "progress": progress}
+    bench = Bench(paths.generated / "folding", how)
+    files = bench.make_starts(list_grasps(ROLLOUTS[preset]))
+    states = {rollout: read_state(file) for rollout, file in files.items()}
+    states = {rollout: state for rollout, state in states.items() if not state.about["fault"]}
+    look, results = bench.make_demonstration(GRASP).looks[0], {}
+    for name, weights in MATCHERS.items():
+        matcher: Matcher = load(weights)
+        picks = {r: choose_picks(matcher.match(look.image, state.image, look.moves[:1, 0]), seed=r.seed)
+                 for r, state in states.items()}  # fmt: skip
+        jobs = {f"{name}-{way}-{r.name}": act_job(files[r], [(pick, find_middle(states[r]))] if pick else [])
+                for r, row in picks.items() for way, pick in row.items()}  # fmt: skip
+        made = run_jobs(jobs, bench.folder / "acts", **how)
+        found = {way: {r.name: judge_grasp(states[r], row[way], read_state(made[f"{name}-{way}-{r.name}"]))
+                       for r, row in picks.items()} for way in WAYS}  # fmt: skip
+        results[name] = {way: summarise_grasps(rows, found["any"]) for way, rows in found.items()}
+    return write_json(paths.results / "grasp.json", results)
+
+
+def choose_picks(match: Match, *, seed: int) -> dict[str, list[float] | None]:
+    """{way: the pixel [x, y] of one query's answer that it grasps at}; None where the answer abstains."""
+    modes = match.modes[0][np.isfinite(match.modes[0]).all(-1)]
+    chosen = (match.best().xy[0], modes[0], modes[np.random.default_rng(seed).integers(len(modes))])
+    return {way: xy.tolist() if np.isfinite(xy).all() else None for way, xy in zip(WAYS, chosen, strict=True)}
+
+
+def find_middle(state: State) -> list[float]:
+    """The pixel [x, y] of the middle of what is seen of the object."""
+    return np.argwhere(state.mask)[:, ::-1].mean(0).tolist()
+
+
+def judge_grasp(before: State, pick: list[float] | None, after: State) -> Outcome:
+    """``distance`` of the grasp to the nearest corner, a share of the side, and whether a corner was ``lifted``.
+
+    No grasp is as far off as the side is long.
+    """
+    side = SIDES_M[GRASP.object]
+    if pick is None:
+        return {"distance": 1.0, "lifted": False}
+    corners, ends = (state.points[CORNERS, :2] for state in (before, after))
+    distance = np.linalg.norm(corners - find_on_table(np.array(pick), before), axis=1).min() / side
+    aim = find_on_table(np.array(find_middle(before)), before)
+    near = np.linalg.norm(ends - aim, axis=1).min() < NEAR * side
+    was = np.linalg.norm(corners - aim, axis=1).min() < NEAR * side
+    return {"distance": float(min(distance, 1.0)), "lifted": bool(near and not was and not after.about["fault"])}
+
+
+def summarise_grasps(rows: Mapping[str, Outcome], others: Mapping[str, Outcome]) -> dict[str, Any]:
+    """Mean ``distance``, share ``lifted``, and how much farther than ``others`` the grasps are, ``beyond``."""
+    apart = [row["distance"] - others[name]["distance"] for name, row in rows.items()]
+    return {"distance": estimate_mean([row["distance"] for row in rows.values()]), "beyond": estimate_mean(apart),
+            "lifted": estimate_share([bool(row["lifted"]) for row in rows.values()])}  # fmt: skip
+
+
+def main() -> None:
+    """Grasp with every matcher."""
+    parser = argparse.ArgumentParser(prog="python -m mmgsd.studies.grasp", description=__doc__.split("\n")[0])
+    parser.add_argument("preset", choices=tuple(ROLLOUTS))
+    parser.add_argument("--workers", type=int, default=0, help="child processes at once (default: one a core)")
+    args = parser.parse_args()
+    print(run_grasps(args.preset, find_root(), workers=args.workers))
+
+
+if __name__ == "__main__":
+    run_command(main, kept="finished states are kept, and the same command goes on")

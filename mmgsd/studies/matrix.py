@@ -1,0 +1,259 @@
+"""All models of a preset and its baselines as independent tasks, the most important first: here, or on a Dask cluster.
+
+    python -m mmgsd.studies.matrix paper                              trains and asks each model; a killed call goes on
+    python -m mmgsd.studies.matrix paper --only cloth-spcl            those whose name holds that text
+    python -m mmgsd.studies.matrix paper --scheduler tcp://host:8786  each worker one model at a time, on its own GPU
+    python -m mmgsd.studies.matrix quick --seeds 3                    instead the seeds study, each model with three
+    python -m mmgsd.studies.matrix paper --study robustness           instead the models of one study
+    python -m mmgsd.studies.matrix quick --study robustness --steps 300         each of so many steps
+
+Notebooks find the models and their tables of answers where they would have put them.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+from mmgsd.checks import read_count
+from mmgsd.cluster import open_client, wait_for_each
+from mmgsd.command import run_command
+from mmgsd.config import OBJECTS, Preset, TrainConfig, load_preset
+from mmgsd.files import DamagedFileError
+from mmgsd.learn.training import train_model
+from mmgsd.measure.evaluation import (
+    BASELINES,
+    CHANCE,
+    evaluate_baseline,
+    evaluate_model,
+    load_queries,
+    read_results,
+    summarise,
+    write_results,
+)
+from mmgsd.model.tensors import WEIGHTS, describe_run
+from mmgsd.paths import Paths, find_root
+from mmgsd.progress import ProgressBar
+from mmgsd.studies.models import (
+    RUN,
+    STUDIES,
+    configure_study,
+    list_rows,
+    list_runs,
+    vary_seed,
+    vary_sigma,
+)
+from mmgsd.studies.parameters import read_scheduler
+
+TABLES = ("budget", "robustness", "backbones")  # studies with a file of their own, of models under their rows' names
+VALIDATIONS = 8  # RMSE on held-out simulations, in a model's log
+
+Task = TrainConfig | tuple[str, str]  # a model to train and ask, or an object and a baseline to ask
+
+
+def list_repeats(preset: Preset, seeds: int, *, steps: int = 0) -> list[TrainConfig]:
+    """The models compared by seeds, of other ``steps`` than its where they are not 0: all with seed 0, then 1…"""
+    rows = vary_seed(range(seeds))
+    keyed = {object: configure_study(preset, object, "seeds", rows, steps=steps) for object in OBJECTS}
+    models = [keyed[object][row.name] for row in rows for object in OBJECTS]
+    return sorted(models, key=lambda model: model.seed)
+
+
+def list_tasks(preset: Preset, studies: Sequence[str] = RUN) -> list[Task]:
+    """The models of some studies (`list_runs`), the first followed by chance and hand-made ones."""
+    models, first = list_runs(preset, studies), list_runs(preset, studies[:1])
+    if "main" not in studies:
+        return list(models)
+    untrained = [(name, row.name) for kind in ("chance", "hand_made") for row in list_rows(kind) for name in OBJECTS]
+    return [*first, *untrained, *models[len(first) :]]
+
+
+def name_task(task: Task) -> str:
+    """What a model's folder is called, or "cloth-sift"."""
+    return task.name if isinstance(task, TrainConfig) else "-".join(task)
+
+
+def run_task(
+    task: Task, preset: Preset, root: Path, after: tuple[str, float] | None = None, *, progress: bool = False
+) -> tuple[str, float]:
+    """Train a model and ask it the preset's questions, or ask a baseline, unless that is done; name and RMSE (px).
+
+    Models of the preset that it starts from are trained first; ``after`` is the last one's result, to be waited for.
+    """
+    paths, name = Paths(root, preset.name), name_task(task)
+    if isinstance(task, TrainConfig):
+        data = paths.dataset(task.object)
+        for model in (*_find_start(task, preset), task):
+            every = max(1, model.steps // VALIDATIONS)
+            weights = train_model(model, data, paths.model(model), progress=progress, validate_every=every)
+        how = {"group": task.group, "progress": progress}
+        out = evaluate_model(weights, data, preset.evaluate, paths.queries(name), **how)
+    else:
+        data, out = paths.dataset(task[0]), paths.queries(name)
+        evaluate_baseline(task[1], data, preset.evaluate, out, progress=progress)
+    queries = load_queries(out)
+    return name, float(queries.rmse_px[queries.visible].mean())
+
+
+def _find_start(task: Task, preset: Preset) -> list[TrainConfig]:
+    """The models of the preset that a task starts from, if it does: each from the one before it."""
+    start = task.trunk_weights if isinstance(task, TrainConfig) else ""
+    found = [model for model in list_runs(preset, STUDIES) if model.name == start]
+    return [*_find_start(found[0], preset), *found] if found else []
+
+
+def run_tasks(tasks: list[Task], preset: Preset, root: Path, *, scheduler: str = "") -> Iterator[tuple]:
+    """`run_task` of each, as they are done; on the workers of the Dask cluster at ``scheduler`` if one is given.
+
+    These need the same folder ``root``, and one thread each: a worker trains one model at a time.
+    """
+    if not scheduler:
+        yield from (run_task(task, preset, root, progress=True) for task in tasks)
+        return
+    with open_client(scheduler) as client:
+        futures = {}
+        for i, task in enumerate(tasks):
+            after = next((futures.get(start.name) for start in reversed(_find_start(task, preset))), None)
+            futures[name_task(task)] = client.submit(run_task, task, preset, root, after, pure=False, priority=-i)
+        yield from (future.result() for future in wait_for_each(client, futures.values()))
+
+
+def write_tables(preset: Preset, root: Path) -> None:
+    """Write what is trained and asked so far: the main table, those of the studies at the equal budget, that of σ.
+
+    Where the answers are not here, given on another machine, the row that is there is kept if it is of the same model.
+    """
+    write_main_table(preset, root)
+    for study in TABLES:
+        write_study_table(preset, root, study)
+    write_sigma_table(preset, root)
+
+
+def write_study_table(preset: Preset, root: Path, study: str, *, steps: int = 0) -> None:
+    """Write the table of a study of `TABLES`, by the rule of `write_tables`.
+
+    The models of other ``steps`` than the study's have a file of their own: robustness_300.json.
+    """
+    models = {name: configure_study(preset, name, study, steps=steps) for name in OBJECTS}
+    _write_study(models, Paths(root, preset.name), f"{study}_{steps}" if steps else study)
+
+
+def write_main_table(preset: Preset, root: Path) -> dict[str, dict[str, dict]]:
+    """Write rmse.json and runs.json, by the rule of `write_tables`; returns the former, {object: {method: row}}."""
+    paths = Paths(root, preset.name)
+    errors, costs = (read_results(paths.results / f"{name}.json", depth=n) for name, n in (("rmse", 2), ("runs", 1)))
+    tables, runs = {name: {} for name in OBJECTS}, {}
+    for name in OBJECTS:
+        models = configure_study(preset, name, "main")
+        for method in (*models, *BASELINES, *CHANCE):
+            key, stored = f"{name}-{method}", errors.get(name, {}).get(method, {})
+            row, run = _find_row(paths, key, models.get(method), stored, costs.get(key, {}))
+            tables[name] |= {method: row} if row else {}
+            runs |= {key: run} if run else {}
+    write_results(runs, paths.results / "runs.json")
+    write_results(tables, paths.results / "rmse.json")
+    return tables
+
+
+def write_sigma_table(preset: Preset, root: Path, sigmas_px: Sequence[float] = (), *, steps: int = 0) -> None:
+    """Write sigma.json, by the rule of `write_tables`; ``sigmas_px`` besides the preset's and those that are there.
+
+    The models of other ``steps`` than the smaller budget's have a file of their own: sigma_4000.json.
+    """
+    steps = read_count("steps", steps)
+    paths, study = Paths(root, preset.name), f"sigma_{steps}" if steps else "sigma"
+    there = _read_keys(paths.results / f"{study}.json", float)
+    rows = vary_sigma([*preset.sigmas_px, *sigmas_px, *there])
+    _write_study({name: configure_study(preset, name, "sigma", rows, steps=steps) for name in OBJECTS}, paths, study)
+
+
+def write_seed_table(preset: Preset, root: Path, seeds: int = 0, *, steps: int = 0) -> None:
+    """Write seeds.json, by the rule of `write_tables`: of the seeds 0 to ``seeds`` - 1, and those that are there.
+
+    The models of other ``steps`` than the main table's have a file of their own: seeds_1000.json. Of those that the
+    study of the smaller budget has as well, its rows are taken where there are no others.
+    """
+    seeds, steps = read_count("seeds", seeds), read_count("steps", steps)
+    paths, study = Paths(root, preset.name), f"seeds_{steps}" if steps else "seeds"
+    there = _read_keys(paths.results / f"{study}.json", lambda key: int(key.rpartition("-")[2]))
+    rows = vary_seed([*range(seeds), *there])
+    models = {name: configure_study(preset, name, "seeds", rows, steps=steps) for name in OBJECTS}
+    _write_study(models, paths, study, beside="budget")
+
+
+def _read_keys(path: Path, convert: Callable[[str], float]) -> list[float]:
+    """The numbers that a study's rows are called by; DamagedFileError where one is none."""
+    try:
+        return [convert(key) for rows in read_results(path, depth=2).values() for key in rows]
+    except ValueError as error:
+        if isinstance(error, DamagedFileError):
+            raise
+        raise DamagedFileError(f"{path} has a row of another study ({error}): restore it, or remove the row") from error
+
+
+def _write_study(models: dict[str, dict[str, TrainConfig]], paths: Paths, study: str, *, beside: str = "") -> None:
+    """One file {object: {key: errors, and under "run" the cost}} of models under the same keys, where any is done.
+
+    A model's row that this file lacks is that of the same model in the file ``beside``.
+    """
+    stored, rows = read_results(paths.results / f"{study}.json", depth=2), {}
+    others = read_results(paths.results / f"{beside}.json", depth=2) if beside else {}
+    named = {row["run"].get("model"): row for shared in others.values() for row in shared.values() if "run" in row}
+    for name, keyed in models.items():
+        for key, model in keyed.items():
+            kept = stored.get(name, {}).get(key) or named.get(model.name, {})
+            row, run = _find_row(paths, "", model, kept, kept.get("run", {}))
+            if row:
+                rows.setdefault(name, {})[key] = {**row, "run": run}
+    if rows or stored:
+        write_results(rows, paths.results / f"{study}.json")
+
+
+def _find_row(paths: Paths, key: str, model: TrainConfig | None, row: dict, run: dict) -> tuple[dict, dict]:
+    """Results and cost of a model, or of the baseline ``key``: those of its answers, or else what is stored."""
+    out = paths.queries(model.name if model else key)
+    if out.is_file():
+        return summarise({key: out})[key], describe_run(paths.model(model) / WEIGHTS) if model else {}
+    return (row, run) if model is None or run.get("model") == model.name else ({}, {})
+
+
+def main() -> None:
+    """Run the models and baselines of a preset, a line each."""
+    parser = argparse.ArgumentParser(prog="python -m mmgsd.studies.matrix", description=__doc__.split("\n")[0])
+    parser.add_argument("preset")
+    parser.add_argument("--only", default="", help="those whose name holds this text, like cloth or cloth-spcl")
+    parser.add_argument("--study", default="", choices=STUDIES, help="instead the models of one study")
+    parser.add_argument("--seeds", type=int, default=0, help="instead the models compared by seeds, each with so many")
+    parser.add_argument("--steps", type=int, default=0, help=f"of those, or of the study {' or '.join(TABLES)}")
+    parser.add_argument("--scheduler", default="", help="address of a Dask scheduler; none: this process")
+    args = parser.parse_args()
+    if args.seeds < 0 or args.steps < 0 or (args.steps and not (args.seeds or args.study in TABLES)):
+        studies = " or ".join(TABLES)
+        parser.error(f"--seeds and --steps must be positive, and --steps needs --seeds or --study {studies}")
+    if args.study and args.seeds:
+        parser.error("--study and --seeds are two different lists of models: give one of them")
+    preset, studies = load_preset(args.preset), (args.study,) if args.study else RUN
+    tasks = list_repeats(preset, args.seeds, steps=args.steps) if args.seeds else list_tasks(preset, studies)
+    if args.steps and not args.seeds:
+        keyed = [configure_study(preset, name, args.study, steps=args.steps) for name in OBJECTS]
+        tasks = [model for models in keyed for model in models.values()]
+    tasks = [task for task in tasks if args.only in name_task(task)]
+    if not tasks:
+        parser.error(f"--only {args.only!r}: no model or baseline of the preset {preset.name} has a name with that")
+    scheduler = read_scheduler("--scheduler", args.scheduler)
+    done = run_tasks(tasks, preset, find_root(), scheduler=scheduler)
+    for name, rmse in ProgressBar(done, total=len(tasks), desc="models and baselines"):
+        ProgressBar.write(f"{name}: {rmse:.1f} px")
+        if args.seeds:
+            write_seed_table(preset, find_root(), args.seeds, steps=args.steps)
+        elif args.steps:
+            write_study_table(preset, find_root(), args.study, steps=args.steps)
+        else:
+            write_tables(preset, find_root())
+
+
+if __name__ == "__main__":
+    run_command(
+        main, kept="finished models and answers are kept, and the same command goes on from the last checkpoint"
+    )

@@ -1,0 +1,294 @@
+"""What a notebook may be told: every parameter is read and checked before anything slow or destructive is done.
+
+A reader takes a parameter's name and what it was given, and returns what the notebook goes on with, or raises the
+ValueError that names both and what is accepted. papermill hands over text for all but True, False and numbers, so
+readers take text as well: "8", "false", "[1, 4]", "cloth rope".
+"""
+
+from __future__ import annotations
+
+import ast
+import difflib
+import json
+import math
+import numbers
+import re
+import socket
+from collections.abc import Callable, Collection, Iterable, Mapping, MutableMapping
+from pathlib import Path
+from typing import Any
+
+from mmgsd.config import PRESETS, TrainConfig
+from mmgsd.paths import Paths, find_root, find_shipped
+from mmgsd.studies.models import list_rows
+
+Reader = Callable[[str, Any], Any]
+ADDRESS = re.compile(r"((tcp|tls|ws|wss|ucx)://)?(?P<host>\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+):(?P<port>[0-9]{1,5})")
+SECONDS = 5.0  # that a scheduler has to answer
+INJECTED = "# Parameters"  # how the cell begins that papermill puts after the one tagged ``parameters``
+
+
+def read_parameters(namespace: MutableMapping[str, Any], **readers: Reader) -> None:
+    """Replace each named parameter in a notebook's ``globals()`` by what its reader makes of it: all of them, or none.
+
+    ValueError from the first reader that refuses, for a parameter that is not set, and for one that is no parameter of
+    this notebook: papermill runs on after a mistyped name.
+    """
+    for cell in namespace.get("In", [])[-3:-1]:  # the parameters and papermill's, if this cell is run after them
+        for name in _list_assigned(cell, readers):
+            if name not in readers:
+                raise ValueError(f"{name} is no parameter of this notebook: {_describe_choices(name, readers)}")
+    for name in readers:
+        if name not in namespace:
+            raise ValueError(f"{name} must be set in the cell of the parameters")
+    namespace.update({name: reader(name, namespace[name]) for name, reader in readers.items()})
+
+
+def check_made(paths: Paths, by: str, files: Iterable[Path], **told: str) -> None:
+    """ValueError where one of ``files`` is not there; ``by`` makes it, for the preset and what else is ``told``."""
+    same = ", ".join(f"{name}={value!r}" for name, value in {"preset": paths.preset, **told}.items())
+    for file in files:
+        if not file.exists():
+            place = file.relative_to(paths.root) if file.is_relative_to(paths.root) else file
+            raise ValueError(f"for {same} there is no {place} yet: run {by} for it first")
+
+
+def check_stored(paths: Paths, notebook: str, *names: str) -> None:
+    """ValueError where the preset has no results of one of these names yet; ``notebook`` makes them, if it is to."""
+    check_made(paths, f"{notebook} with run=True", [paths.results / name for name in names])
+
+
+def check_images(paths: Paths, objects: Iterable[str], *, split: str = "test") -> None:
+    """ValueError where the images of a split of any of ``objects`` are not rendered."""
+    files = [paths.dataset(name) / "dataset.json" for name in objects]
+    check_made(paths, "01_render_data with run=True", files)
+    for file in files:
+        if split not in json.loads(file.read_text())["images"]:
+            raise ValueError(f"for preset={paths.preset!r} there are no {split} images in {file.parent}: "
+                             "run 01_render_data for it with run=True, only_test=False first")  # fmt: skip
+
+
+def check_training(paths: Paths, models: Iterable[TrainConfig], *, overwrite: bool = False) -> None:
+    """ValueError where images are missing that ``models`` need: test images, and training images of what is trained."""
+    from mmgsd.model.tensors import WEIGHTS  # with torch: not in every notebook that reads parameters
+
+    there = {model: (paths.model(model) / WEIGHTS).is_file() and not overwrite for model in models}
+    check_images(paths, sorted({model.object for model in there}))
+    check_images(paths, sorted({model.object for model, trained in there.items() if not trained}), split="train")
+
+
+def read_preset(name: str, value: Any) -> str:
+    """The name of a preset."""
+    return one_of(PRESETS)(name, value)
+
+
+def read_method(name: str, value: Any) -> str:
+    """The name of a model of the main table, which has the same in every preset."""
+    return one_of([row.name for row in list_rows("main")])(name, value)
+
+
+def one_of(choices: Collection[str]) -> Reader:
+    """A reader of one of some names."""
+
+    def read(name: str, value: Any) -> str:
+        if not isinstance(value, str) or value.strip() not in choices:
+            _refuse(name, value, _describe_choices(value, choices))
+        return value.strip()
+
+    return read
+
+
+def among(values: Collection[int], whose: str) -> Reader:
+    """A reader of one of some whole numbers, ``whose`` says which these are."""
+
+    def read(name: str, value: Any) -> int:
+        found = _to_number(value)
+        if found not in values:
+            first = ", ".join(map(str, sorted(values)[:3]))
+            _refuse(name, value, f"one of {whose} ({first}, … {max(values)})")
+        return int(found)
+
+    return read
+
+
+def whole(least: int = 0, most: int | None = None) -> Reader:
+    """A reader of whole numbers from ``least`` on, up to and with ``most`` if given."""
+    accepted = f"a whole number {_describe_range(least, most)}"
+
+    def read(name: str, value: Any) -> int:
+        found = _to_number(value)
+        if found is None or found != int(found) or found < least or (most is not None and found > most):
+            _refuse(name, value, accepted)
+        return int(found)
+
+    return read
+
+
+def number(*, above: float | None = None, least: float = -math.inf, most: float = math.inf) -> Reader:
+    """A reader of finite numbers ``above`` one, or from ``least`` to ``most``."""
+    accepted = f"a number {_describe_range(least, most)}" if above is None else f"a number greater than {above:g}"
+
+    def read(name: str, value: Any) -> float:
+        found = _to_number(value)
+        if found is None or not least <= found <= most or (above is not None and found <= above):
+            _refuse(name, value, accepted)
+        return found
+
+    return read
+
+
+def listed(reader: Reader, *, least: int = 0, most: int | None = None) -> Reader:
+    """A reader of lists of so many items; text may hold a list, or items between commas or blanks."""
+    accepted = f"{least}" if least == most else f"{_describe_range(least, most)}"
+
+    def read(name: str, value: Any) -> list:
+        items = _to_list(value)
+        if items is None or len(items) < least or (most is not None and len(items) > most):
+            _refuse(name, value, f"a list, its length {accepted}")
+        return [reader(f"each of {name}", item) for item in items]
+
+    return read
+
+
+def optional(reader: Reader) -> Reader:
+    """A reader that takes "" (or None) as well, and returns "" then."""
+
+    def read(name: str, value: Any) -> Any:
+        if value is None or value == "":
+            return ""
+        try:
+            return reader(name, value)
+        except ValueError as error:
+            raise ValueError(f'{error}; or "" for none') from error
+
+    return read
+
+
+def read_pixels(name: str, value: Any) -> list[list[float]]:
+    """Pixels [[column, row], …] in px, at least one; a single [column, row] is a list of one."""
+    pixels = _to_list(value)
+    if pixels and all(_to_number(item) is not None for item in pixels):
+        pixels = [pixels]
+    pixels = [_to_list(pixel) or [] for pixel in pixels or []]
+    found = [[_to_number(item) for item in pixel] for pixel in pixels]
+    if not found or any(len(pixel) != 2 or None in pixel for pixel in found):
+        _refuse(name, value, "pixels [[column, row], …] of image0, such as [[235, 80]]")
+    return found
+
+
+def read_device(name: str, value: Any) -> str:
+    """What torch computes on: "" for the GPU where there is one, "cpu", "cuda", or the GPU of a number, "cuda:1"."""
+    import torch  # not in every notebook that reads parameters
+
+    gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    names = ["", "cpu", *(["cuda", *(f"cuda:{i}" for i in range(gpus))] if gpus else [])]
+    value = "" if value is None else value
+    if value not in names:
+        _refuse(name, value, _describe_choices(value, names) + ("" if gpus else ": torch finds no GPU here"))
+    return value
+
+
+def read_scheduler(name: str, value: Any) -> str:
+    """The address of a Dask scheduler that answers, host:port or tcp://host:port; "" (or None) for none."""
+    if value is None or value == "":
+        return ""
+    found = ADDRESS.fullmatch(value) if isinstance(value, str) else None
+    if not found or not 0 < int(found["port"]) < 65536:
+        _refuse(name, value, 'an address host:port or tcp://host:port, or "" for none')
+    try:
+        socket.create_connection((found["host"].strip("[]"), int(found["port"])), timeout=SECONDS).close()
+    except OSError as error:
+        raise ValueError(f"{name} must be the address of a scheduler that runs, got {value!r}: {error}") from error
+    return value
+
+
+def read_weights(name: str, value: Any) -> str:
+    """Trained weights: the name of a model in data/weights, or a safetensors file (see `find_file`)."""
+    shipped = sorted(path.stem for path in find_shipped().glob("*.safetensors"))
+    if value in shipped:
+        return value
+    try:
+        found = find_file(value, name)
+    except ValueError as error:
+        raise ValueError(f"{error}; or {_describe_choices(value, shipped)}") from error
+    return str(value) if Path(value).is_file() else str(found)  # a model's name depends on how its start was written
+
+
+def read_object(name: str, value: Any) -> str:
+    """The name of a file in data/objects."""
+    return one_of(sorted(path.stem for path in (find_root() / "data" / "objects").glob("*.json")))(name, value)
+
+
+def read_file(name: str, value: Any) -> Path:
+    """An existing file (see `find_file`)."""
+    return find_file(value, name)
+
+
+def find_file(path: Path | str, name: str = "path") -> Path:
+    """An existing file, by one rule wherever a path is asked for; ValueError, which says ``name``, where it is none.
+
+    A relative path is looked for from where the notebook or the command was started, then from the repository's root;
+    ``~`` is the home folder.
+    """
+    if not isinstance(path, str | Path) or not str(path).strip():
+        raise ValueError(f"{name} must be the path of a file, got {path!r}")
+    given = Path(path).expanduser()
+    places = dict.fromkeys(place / given for place in (Path.cwd(), find_root()))  # an absolute path stays as it is
+    for place in places:
+        if place.is_file():
+            return place
+    looked = " or ".join(map(str, places))
+    raise ValueError(f"{name} must be the path of a file that exists, got {str(path)!r}: there is no file {looked}")
+
+
+def _list_assigned(cell: str, known: Mapping[str, Any]) -> list[str]:
+    """The names that a cell of parameters assigns: one that papermill wrote, or assigns known names and only values."""
+    try:
+        statements = ast.parse(cell).body
+    except SyntaxError:
+        return []
+    if not all(isinstance(s, ast.Assign) and isinstance(s.targets[0], ast.Name) for s in statements):
+        return []
+    names = [statement.targets[0].id for statement in statements]
+    return names if cell.startswith(INJECTED) or set(names) & set(known) else []
+
+
+def _describe_choices(value: Any, choices: Collection[str]) -> str:
+    """ "one of 'a', 'b' (did you mean 'a'?)"."""
+    close = difflib.get_close_matches(str(value), choices, n=1)
+    return f"one of {', '.join(map(repr, choices))}" + (f" (did you mean {close[0]!r}?)" if close else "")
+
+
+def _describe_range(least: float, most: float | None) -> str:
+    if most is None or math.isinf(most):
+        return f"from {least:g} on"
+    return f"from {least:g} to {most:g}"
+
+
+def _to_number(value: Any) -> float | None:
+    """A finite number, or text that is one."""
+    if isinstance(value, bool) or not isinstance(value, numbers.Real | str):
+        return None
+    try:
+        found = float(value)
+    except (ValueError, OverflowError):
+        return None
+    return found if math.isfinite(found) else None
+
+
+def _to_list(value: Any) -> list | None:
+    """The items of a list, of text that holds one, or of text between commas or blanks; a number is a list of one."""
+    if isinstance(value, str):
+        text = value.strip()
+        try:
+            value = ast.literal_eval(text)
+        except (ValueError, SyntaxError, TypeError):
+            value = [item for item in re.split(r"[\s,]+", re.sub(r"^\[(.*)\]$", r"\1", text)) if item]
+        value = [value] if isinstance(value, str) else value
+    if _to_number(value) is not None:
+        return [value]
+    return list(value) if isinstance(value, Iterable) and not isinstance(value, Mapping) else None
+
+
+def _refuse(name: str, value: Any, accepted: str) -> None:
+    raise ValueError(f"{name} must be {accepted}, got {value!r}")

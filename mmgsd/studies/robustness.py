@@ -1,0 +1,57 @@
+"""Before and after: errors on clean and cluttered renders, and what is found in photographs."""
+
+from __future__ import annotations
+
+from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from mmgsd.config import OBJECTS
+from mmgsd.figures.style import PAGE_IN, check_filled, finish_axes, styled
+from mmgsd.match.baselines import BASELINES
+from mmgsd.studies.models import get_colour, get_label
+from mmgsd.studies.shipped import Rows, get_photographs, list_names
+
+PANELS = (  # a title, what is measured there, and times what
+    ("Clean renders", "paper", "rmse_mean", 1.0, "RMSE (px)"),
+    ("Cluttered renders", "workspace", "rmse_mean", 1.0, "RMSE (px)"),
+    ("Photographs", "photographs", "found@5%", 100.0, "Corners, ends found (%)"),
+)
+COLOURS = {"": get_colour("shipped"), "paper": get_colour("mmgsd")} | {name: get_colour(name) for name in BASELINES}
+LABELS = {"": "MMGSD, shipped", "paper": "MMGSD, clean images only"}
+
+
+@styled
+def plot_robustness(rows: Rows) -> Figure:
+    """A panel for clean renders, cluttered ones and photographs: a bar for each model and baseline of each object.
+
+    ``rows`` as `mmgsd.measure.shipped` stores them; what was not measured has no bar. ValueError of no row.
+    """
+    check_filled("rows", rows)
+    names = [name for object in OBJECTS for name in list_names(rows, object)]
+    size = PAGE_IN, 0.5 + 0.17 * len(names)
+    figure, axes = plt.subplots(1, len(PANELS), figsize=size, layout="constrained", sharey=True)
+    for axis, (title, part, key, scale, unit) in zip(axes, PANELS, strict=True):
+        for place, name in enumerate(names):
+            value = (get_photographs(rows, name) if part == "photographs" else rows[name].get(part, {})).get(key)
+            _draw_bar(axis, place + 0.6 * (not name.startswith(OBJECTS[0])), name, value and scale * value)
+        axis.set(title=title, xlabel=unit)
+    widest = 1.12 * max(1.0, *(axis.dataLim.x1 for axis in axes[:2]))
+    for axis, most in zip(axes, (widest, widest, 100), strict=True):
+        axis.set_xlim(0, most)
+    places = [place + 0.6 * (not name.startswith(OBJECTS[0])) for place, name in enumerate(names)]
+    axes[0].set_yticks(places, [_label(name) for name in names])
+    axes[0].invert_yaxis()
+    return finish_axes(figure)
+
+
+def _label(name: str) -> str:
+    object, _, kind = name.partition("@")[0].partition("-")
+    return f"{object.capitalize()}: {LABELS.get(kind) or get_label(kind)}"
+
+
+def _draw_bar(axis: Axes, place: float, name: str, value: float | None) -> None:
+    if value is None:
+        return
+    axis.barh(place, value, height=0.72, color=COLOURS[name.partition("@")[0].partition("-")[2]])
+    axis.annotate(f"{value:.0f}", (value, place), xytext=(2, 0), textcoords="offset points", va="center", fontsize=6.5)

@@ -1,0 +1,305 @@
+"""What shipped weights, and what one would pick instead, do on clean renders, on cluttered ones and on photographs.
+
+    python -m mmgsd.studies.shipped cloth cloth-paper daisy --photographs FOLDER    -> data/results/shipped.json
+    python -m mmgsd.studies.shipped cloth@1,1 --photographs FOLDER     its modes read with another power and sharpness
+    python -m mmgsd.studies.shipped robustness --photographs FOLDER    the models of that study, once they are trained
+    python -m mmgsd.studies.shipped cloth --cloth-renders FOLDER       and others' renders of a cloth
+
+A row a name: of weights in data/weights; of a baseline, which is asked about each object with the true masks, and in
+photographs with those that the shipped weights see, and whose modes are read as theirs; or of each model of a study of
+`STUDIES` of the preset `paper`, or of another with so many steps each (--preset quick --steps 300), which is asked
+about that preset's images. How modes are read (`mmgsd.match.mixture.Reading`) is the weights' own, unless the name says
+another after an @. The test images of the presets `paper` and `workspace`, or of that one, have to be rendered, unless
+--photographs-alone leaves them out: what a row has of the same weights stays. Tables of answers are kept, so that a
+killed call goes on.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from mmgsd.checks import read_count
+from mmgsd.command import run_command
+from mmgsd.config import OBJECTS, PRESETS, Preset, load_preset
+from mmgsd.files import write_json
+from mmgsd.match.baselines import BASELINES
+from mmgsd.measure import shipped as measured
+from mmgsd.measure.evaluation import read_results
+from mmgsd.measure.shipped import measure_baseline, measure_read, measure_weights, name_read
+from mmgsd.model.tensors import WEIGHTS
+from mmgsd.paths import Paths, find_root
+from mmgsd.studies.models import PAPER, ROWS, SHIPPED, configure_study, get_label
+
+STUDIES = ("robustness", "backbones")
+RESULTS = "shipped.json"
+Rows = Mapping[str, Mapping[str, Any]]  # data/results/shipped.json, {name: what `mmgsd.measure.shipped` found}
+SETS = {"paper": "clean", "workspace": "cluttered"}  # test images: what readers know them as
+SIDES = {"cloth": "side", "rope": "length"}  # of what an error is a share
+READING = ("power", "sharpness")
+SOURCES = """\
+The photographs, counted as on the
+[results page](data/results/README.md#is-it-right-about-clutter-and-photographs), are from {sources}."""
+COUNTS = "Photographs: {counts}. One question about two new images takes {slowest:.0f} ms ({hardware})."
+
+
+def list_names(rows: Rows, object: str) -> list[str]:
+    """The rows of an object: weights for everything, those of the paper's images, then baselines; all read alike."""
+    order = [object, f"{object}-paper", *(f"{object}-{name}" for name in BASELINES)]
+    return [found for name in order if (found := find_alike(rows, name)) in rows]
+
+
+def find_alike(rows: Rows, name: str) -> str:
+    """The row of a name whose modes are read as the object's shipped weights are: its own, or one read so."""
+    like = rows.get(name.partition("-")[0], {})
+    reading = [like.get(key) for key in READING]
+    if None in reading or [rows.get(name, {}).get(key) for key in READING] == reading:
+        return name
+    return f"{name}@{','.join(f'{value:g}' for value in reading)}"
+
+
+def label_row(name: str) -> str:
+    """What tables and figures call a row: weights by the name that loads them."""
+    weights = name.partition("@")[0]
+    kind = weights.partition("-")[2]
+    return get_label(kind) if kind in BASELINES else f"`{weights}`"
+
+
+def get_photographs(rows: Rows, name: str) -> Mapping[str, Any]:
+    """What a row found in photographs; nothing where it counted other marks than the object's shipped weights did."""
+    found, like = (rows.get(key, {}).get("photographs", {}) for key in (name, name.partition("@")[0].partition("-")[0]))
+    return found if found.get("marks") == like.get("marks") else {}
+
+
+def make_limits_table(rows: Rows) -> str:
+    """Markdown of what an answer of the shipped weights is worth, and costs, in a user's units."""
+    seen = (_format(rows[object].get("photographs"), "found@5%", 100, ".0f", " %") for object in SIDES)
+    slowest = rows[max(SIDES, key=lambda object: rows[object]["milliseconds"])]
+    lines = {
+        "it knows": "square cloths, and ropes whose ends look alike; anything else has to be learnt first",
+        **{f"mean error, {word} renders": "; ".join(_tell_error(rows[object], preset) for object in SIDES)
+           for preset, word in SETS.items()},
+        "in photographs": "found within 5 % of the size: {} of a cloth's corners, {} of a rope's ends".format(*seen),
+        "it takes": f"{slowest['milliseconds']:.0f} ms for two new images and a question ({slowest['hardware']}); "
+                    "a GPU is not needed",
+        "on a robot": "never tried",
+    }  # fmt: skip
+    return "\n".join(["|  |  |", "|---|---|", *map(_join, lines.items())])
+
+
+def _tell_error(row: Mapping[str, Any], preset: str) -> str:
+    px, size = _format(row.get(preset), "rmse_mean", 1, ".0f", " px"), row.get("side_px")
+    share = _format(row.get(preset) if size else None, "rmse_mean", 100 / (size or 1), ".0f", " %")
+    return f"{row['object']} {px}, {share} of its {SIDES[row['object']]}"
+
+
+def make_pictures_table(rows: Rows) -> str:
+    """Markdown of errors on clean and cluttered renders and of what is found in photographs, a row a model."""
+    return _make_pictures_lines(
+        rows, {name: label_row(name) for object in OBJECTS for name in list_names(rows, object)}
+    )
+
+
+def _make_pictures_lines(rows: Rows, labels: Mapping[str, str]) -> str:
+    found = "photographs: found", "spurious", "not answered", "best of the rest"
+    found = found if any(get_photographs(rows, name) for name in labels) else ()
+    heads = ["", *(f"{word}: RMSE px" for word in SETS.values()), *found]
+    lines = [_join(heads), "|---" * len(heads) + "|"]
+    for name, label in labels.items():
+        errors = [_format(rows[name].get(preset), "rmse_mean", 1, ".1f") for preset in SETS]
+        photographs = get_photographs(rows, name)
+        shares = [_say_interval(photographs, key) for key in ("found@5%", "spurious")]
+        unanswered = _format(photographs, "unanswered", 100, ".0f", " %")
+        best = _format(photographs, "best", 1, ".1f", " %")
+        object = name.partition("@")[0].partition("-")[0]
+        cells = [f"{object}, {label}", *errors, *shares, unanswered, best]
+        lines.append(_join(cells[: len(heads)]))
+    return "\n".join(lines)
+
+
+def _say_interval(photographs: Mapping[str, Any], key: str) -> str:
+    """A share with its 95 % interval, where that is known."""
+    low_high = (photographs.get("intervals") or {}).get(key)
+    interval = " ({:.0f} to {:.0f})".format(*(100 * value for value in low_high)) if low_high else ""
+    return _format(photographs, key, 100, ".0f", " %") + interval
+
+
+def make_reading_sentence(rows: Rows) -> str:
+    """How all of `make_pictures_table` are read, and whether intervals of what two weights find overlap."""
+    said = [f"power {rows[object]['power']:g}, sharpness {rows[object]['sharpness']:g} ({object})"
+            for object in OBJECTS]  # fmt: skip
+    apart = [f"those of `{object}` and `{object}-paper` {_tell_apart(rows, object)}" for object in OBJECTS]
+    return f"All are read with {' or '.join(said)}. 95 % intervals by photographs: {', '.join(apart)}."
+
+
+def _tell_apart(rows: Rows, object: str) -> str:
+    found = [get_photographs(rows, name) for name in (object, find_alike(rows, f"{object}-paper"))]
+    intervals = [(photographs.get("intervals") or {}).get("found@5%") for photographs in found]
+    if None in intervals:
+        return "are not compared"
+    (low, high), (other_low, other_high) = intervals
+    return "overlap" if low <= other_high and other_low <= high else "do not overlap"
+
+
+def make_cloth_renders_table(rows: Rows) -> str:
+    """Markdown of the errors on others' renders of a cloth, a row the weights, and what the paper says of its own."""
+    lines = ["|  | RMSE px | median px | pck@20px |", "|---" * 4 + "|"]
+    for name in (find_alike(rows, f"cloth{kind}") for kind in SHIPPED.values()):
+        if found := rows.get(name, {}).get("cloth_renders"):
+            cells = [_format(found, key, 1, ".1f") for key in ("rmse_mean", "median")]
+            lines.append(_join([label_row(name), *cells, _format(found, "pck@20px", 100, ".0f", " %")]))
+    return "\n".join([*lines, f"| *the paper's MMGSD, on images like its training's* | *{PAPER['cloth']}* | – | – |"])
+
+
+def make_parts_table(rows: Rows) -> str:
+    """`make_pictures_table` of the study that adds one part of the training after another."""
+    parts = {name: row.label for name, row in ROWS.items() if "robustness" in row.studies}
+    found = {f"{object}-{name}": label for object in OBJECTS for name, label in parts.items()}
+    return _make_pictures_lines(rows, {name: label for name, label in found.items() if name in rows})
+
+
+def make_readings_table(rows: Rows) -> str:
+    """`make_pictures_table` of weights whose modes are read in more than one way, power and sharpness in the label."""
+    labels = {}
+    for name in (name for name in sorted(rows) if "power" in rows[name]):
+        weights, _, numbers = name.partition("@")
+        again = any(other.startswith(f"{weights}@") for other in rows)
+        row = rows[name]
+        if (numbers or again) and {"photographs", *SETS} & row.keys():
+            labels[name] = f"`{weights}`, power {row['power']:g}, sharpness {row['sharpness']:g}"
+    return _make_pictures_lines(rows, labels)
+
+
+def make_budget_sentence(rows: Rows) -> str:
+    """How much the models of `make_parts_table` learnt from."""
+    row = next(row for row in rows.values() if "steps" in row)
+    images = load_preset(row["preset"]).render["cloth"]
+    return (f"Preset `{row['preset']}`: {row['steps']} steps each, from {images.train_images:,} images of a kind; "
+            f"{images.test_images} test images of each.")  # fmt: skip
+
+
+def make_knowledge_table(rows: Rows) -> str:
+    """Markdown of what shipped weights know beside the matches, and of how far they keep what they promise."""
+    measures = {"mask IoU": "mask_iou", "seen": "auroc_visible", "on the object": "auroc_on_object",
+                "absent": "auroc_absent", "ECE of ellipses": "ece", "of confidences": "ece_confidence",
+                "within the 90 % radius": "within_radius"}  # fmt: skip
+    lines = [_join(["", *measures]), "|---" * (len(measures) + 1) + "|"]
+    for object in OBJECTS:
+        for name in (name for name in (object, f"{object}-paper") if "calibrated" in rows.get(name, {})):
+            for preset, word in SETS.items():
+                found = rows[name].get(preset, {})
+                found = {**found, **found.get("heads", {})}
+                cells = [_format(found, key, 1, ".3f" if "ece" in key else ".2f") for key in measures.values()]
+                lines.append(_join([f"`{name}`, {word}", *cells]))
+    return "\n".join(lines)
+
+
+def make_sources_sentence(rows: Rows) -> str:
+    """What is counted in photographs, and which public repositories they are from."""
+    sources = dict.fromkeys(name for object in OBJECTS for name in rows[object]["photographs"]["sources"])
+    return SOURCES.format(sources=", ".join(f"`{name}`" for name in sources))
+
+
+def make_by_source_table(rows: Rows) -> str:
+    """Markdown of the photographs of each public repository, a row each: what the shipped weights find in them."""
+    lines = ["|  | questions | unanswered | found | at 10 % | spurious | best |", "|---" * 7 + "|"]
+    for object in OBJECTS:
+        for name, said in rows[object]["photographs"]["sources"].items():
+            shares = [
+                _format(said, key, 100, ".0f", " %") for key in ("unanswered", "found@5%", "found@10%", "spurious")
+            ]
+            asked, best = _format(said, "queries", 1, "d"), _format(said, "best", 1, ".1f", " %")
+            lines.append(_join([f"{object}, `{name}`", asked, *shares, best]))
+    return "\n".join(lines)
+
+
+def make_counts_sentence(rows: Rows) -> str:
+    """How many photographs were asked about, and how long a question takes."""
+    counts = " and ".join(f"{rows[object]['photographs']['photographs']} of {object}s" for object in OBJECTS)
+    slowest = max(OBJECTS, key=lambda object: rows[object]["milliseconds"])
+    return COUNTS.format(counts=counts, slowest=rows[slowest]["milliseconds"], hardware=rows[slowest]["hardware"])
+
+
+def _format(row: Mapping[str, Any] | None, key: str, scale: float, form: str, unit: str = "") -> str:
+    value = None if row is None else row.get(key)
+    return "–" if value is None else format(scale * value, form) + unit
+
+
+def _join(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+def measure_study(
+    study: str,
+    root: Path,
+    preset: Preset,
+    *,
+    objects: Sequence[str] = (),
+    steps: int = 0,
+    photographs: Path | None = None,
+) -> dict[str, dict[str, Any]]:
+    """The rows of a study's models, those of some ``objects`` where they are named.
+
+    {object-row: as `measure_weights`, with the preset and the ``steps`` of each}.
+
+    FileNotFoundError where one is not trained yet.
+    """
+    paths = Paths(root, preset.name)
+    keyed = {name: configure_study(preset, name, study, steps=steps) for name in objects or OBJECTS}
+    models = {f"{name}-{key}": model for name, rows in keyed.items() for key, model in rows.items()}
+    files = {key: paths.model(model) / WEIGHTS for key, model in models.items()}
+    missing = [str(file) for file in files.values() if not file.is_file()]
+    if missing:
+        asked = f"{preset.name} --study {study}" + (f" --steps {steps}" if steps else "")
+        raise FileNotFoundError(f"{missing[0]} does not exist: run python -m mmgsd.studies.matrix {asked}")
+    how = {"photographs": photographs, "presets": (preset.name, preset.cluttered)}
+    return {key: measure_weights(key, root, weights=file, **how) | {"preset": preset.name, "steps": models[key].steps}
+            for key, file in files.items()}  # fmt: skip
+
+
+def _measure(name: str, root: Path, args: argparse.Namespace) -> dict[str, dict[str, Any]]:
+    """The rows of a name that is asked for."""
+    if name in STUDIES:
+        how = {"objects": (args.object,) if args.object else (), "steps": args.steps, "photographs": args.photographs}
+        return measure_study(name, root, load_preset(args.preset), **how)
+    how = {"photographs": args.photographs, "presets": () if args.photographs_alone else measured.SETS}
+    if name in BASELINES:
+        rows = {f"{object}-{name}": measure_baseline(name, object, root, **how) for object in OBJECTS}
+        return {name_read(key, row): row for key, row in rows.items()}
+    measure = measure_read if "@" in name else measure_weights
+    return {name: measure(name, root, cloth_renders=args.cloth_renders, **how)}
+
+
+def main() -> None:
+    """Measure some weights and baselines and put their rows into the results."""
+    parser = argparse.ArgumentParser(prog="python -m mmgsd.studies.shipped", description=__doc__.split("\n")[0])
+    parser.add_argument(
+        "names",
+        nargs="+",
+        metavar="NAME",
+        help=f"weights in data/weights, alone or with @POWER,SHARPNESS, {', '.join((*BASELINES, *STUDIES))}",
+    )
+    parser.add_argument("--photographs", type=Path, metavar="FOLDER", help="marked photographs, with index.json")
+    parser.add_argument(
+        "--photographs-alone", action="store_true", help="leave the presets' test images out: they take longest"
+    )
+    parser.add_argument("--cloth-renders", type=Path, metavar="FOLDER", help="others' renders, with knots_info.json")
+    parser.add_argument("--preset", default="paper", choices=tuple(PRESETS), help="of the study (default: paper)")
+    parser.add_argument("--steps", type=int, default=0, help="of each model of a study (default: the study's own)")
+    parser.add_argument("--object", default="", choices=OBJECTS, help="of a study's models those of one object")
+    args = parser.parse_args()
+    root, args.steps = find_root(), read_count("--steps", args.steps)
+    out = root / "data" / "results" / RESULTS
+    for name in args.names:
+        rows = _measure(name, root, args)
+        kept = read_results(out)
+        for key, row in rows.items():  # photographs are not at everybody's hand: a call without them keeps the row's
+            before = kept.get(key, {})
+            kept[key] = (before if before.get("sha256") == row.get("sha256") else {}) | row
+        print(f"{write_json(out, kept)}: {', '.join(rows)}")
+
+
+if __name__ == "__main__":
+    run_command(main)

@@ -1,0 +1,221 @@
+"""The matrix of models: what is in it and in which order, here and on a Dask cluster."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from dask.distributed import LocalCluster
+
+from mmgsd.config import OBJECTS, Preset, load_preset
+from mmgsd.measure.evaluation import write_results
+from mmgsd.studies import matrix
+from mmgsd.studies.matrix import (
+    list_repeats,
+    list_tasks,
+    run_tasks,
+    write_seed_table,
+    write_sigma_table,
+    write_tables,
+)
+from mmgsd.studies.models import configure_model, configure_study, list_rows, list_runs, vary_seed, vary_sigma
+
+SMOKE = load_preset("smoke")
+
+
+def test_the_models_that_matter_most_come_first() -> None:
+    models = list_runs(load_preset("paper"))
+    assert [(m.object, m.method) for m in models[:4]] == [
+        ("cloth", "mmgsd"), ("rope", "mmgsd"), ("cloth", "spcl"), ("rope", "spcl")
+    ]  # fmt: skip
+    assert [m.group for m in models[4:7]] == ["v4", "c4", "d4"]  # the studies, then the rest of the main table
+    steps = [m.steps for m in models]
+    assert models[5] == configure_study(load_preset("paper"), "cloth", "budget")["mmgsd"]  # one model, two tables
+    assert max(i for i, m in enumerate(models) if m.sigma_px == 16) == max(i for i, n in enumerate(steps) if n == 1000)
+    assert set(steps[4:30]) == {1000} and set(steps[30:42]) == {4000} and len(models) == 52
+    assert steps[42:52] == [12000] * 2 + [3000] * 4 + [12000] * 2 + [3500] * 2
+    assert [m.trunk_weights for m in models[44:48]] == [m.name for m in models[42:46]]  # these are trained before
+    assert len({m.name for m in models}) == len(models)
+    assert {m.group for m in models if m.object == "cloth"} == {"c4", "v4", "d4"}
+    assert sorted({m.sigma_px for m in models}) == [1.0, 2.0, 4.0, 8.0, 16.0]
+    assert {m.seed for m in models} == {0}
+    assert sum(m.method == "spcl" and m.dense_weight == 1.0 for m in models) == 8
+    assert sum(m.method == "mmgsd" and m.dense_weight == 0.0 for m in models) == 8
+
+
+def test_seed_after_seed_the_same_models_are_repeated() -> None:
+    preset = load_preset("paper")
+    models = list_repeats(preset, 3)
+    assert [m.seed for m in models] == [0] * 10 + [1] * 10 + [2] * 10
+    assert models[:10] == [configure_model(preset, name, row.name) for row in list_rows("seeds") for name in OBJECTS]
+    of_budget = [configure_study(preset, name, "budget")[row.name] for row in list_rows("seeds") for name in OBJECTS]
+    assert list_repeats(preset, 1, steps=1000) == of_budget
+
+
+def test_errors_of_several_seeds_are_written(
+    tiny_dataset: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    preset = make_tiny(tiny_dataset, tmp_path)
+    monkeypatch.setattr(matrix, "load_preset", lambda _: preset)
+    monkeypatch.setattr(matrix, "find_root", lambda: tmp_path)
+    monkeypatch.setattr("sys.argv", ["matrix", "smoke", "--seeds", "2", "--steps", "1", "--only", "cloth-mm"])
+    matrix.main()
+    written = tmp_path / "data" / "results" / "smoke" / "seeds_1.json"
+    table = json.loads(written.read_text())
+    assert table.keys() == {"cloth"} and table["cloth"].keys() == {"mmgsd-0", "mmgsd-1"}
+    assert [table["cloth"][f"mmgsd-{seed}"]["run"]["seed"] for seed in (0, 1)] == [0, 1]
+    assert len({row["rmse_mean"] for row in table["cloth"].values()}) == 2
+    assert not (written.parent / "rmse.json").exists()
+    for file in (tmp_path / "data" / "generated" / "smoke" / "queries").iterdir():  # as on another machine
+        file.unlink()
+    write_seed_table(preset, tmp_path, 1, steps=1)  # seed 1 stays, though only seed 0 is asked for
+    assert json.loads(written.read_text()) == table
+    model = configure_study(preset, "rope", "seeds", vary_seed([0]), steps=1)["pcl-0"].name
+    of_budget = {"rmse_mean": 3.0, "run": {"model": model}}
+    write_results({"rope": {"pcl": of_budget, "spcl": {"run": {"model": "another"}}}}, written.with_name("budget.json"))
+    write_seed_table(preset, tmp_path, 1, steps=1)  # the same model is not trained twice
+    assert json.loads(written.read_text()) == {**table, "rope": {"pcl-0": of_budget}}
+
+
+@pytest.mark.parametrize("words", ["--seeds -1", "--steps 10", "--seeds 2 --steps -1", "--study main --steps 9"])
+def test_how_often_to_train_is_checked(
+    words: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.setattr("sys.argv", ["matrix", "smoke", *words.split()])
+    with pytest.raises(SystemExit):
+        matrix.main()
+    assert "--seeds and --steps must be positive" in capsys.readouterr().err
+
+
+def test_baselines_come_before_the_studies() -> None:
+    preset = load_preset("paper")
+    tasks = list_tasks(preset)
+    assert [task for task in tasks if not isinstance(task, tuple)] == list_runs(preset)
+    assert tasks[4:8] == [("cloth", "random"), ("rope", "random"), ("cloth", "centre"), ("rope", "centre")]
+    assert {method for _, method in tasks[4:16]} >= {"sift", "orb", "akaze", "daisy"}
+
+
+def test_results_are_written_of_what_is_done(tiny_dataset: Callable[..., Path], tmp_path: Path) -> None:
+    preset = make_tiny(tiny_dataset, tmp_path)
+    cloth = dataclasses.replace(preset.train["cloth"], steps=1)
+    preset = dataclasses.replace(preset, train={**preset.train, "cloth": cloth})
+    small = dataclasses.replace(preset.ablation["cloth"], steps=1, seed=1)
+    preset = dataclasses.replace(preset, ablation={**preset.ablation, "cloth": small})
+    asked_by_hand = configure_study(preset, "cloth", "sigma", vary_sigma([3]))["3"]  # no σ of the preset
+    pcl = configure_study(preset, "cloth", "budget")["pcl"]
+    tasks = [configure_model(preset, "cloth", "spcl_dense"), ("cloth", "sift"), pcl]
+    (_, rmse), (asked, of_sift), (_, of_pcl), (_, of_sigma) = run_tasks([*tasks, asked_by_hand], preset, tmp_path)
+    results = tmp_path / "data" / "results" / "smoke"
+    write_results({"cloth": {"3": {}, "5": {"run": {"model": "another"}}}}, results / "sigma.json")
+    assert asked == "cloth-sift"
+    table = read_results(preset, tmp_path)
+    assert table["rope"] == {}
+    assert table["cloth"]["spcl_dense"]["rmse_mean"] == pytest.approx(rmse, abs=1e-3)
+    assert table["cloth"]["sift"]["rmse_mean"] == pytest.approx(of_sift, abs=1e-3)
+    runs = json.loads((results / "runs.json").read_text())
+    assert runs["cloth-spcl_dense"]["steps"] == 1
+    budget, sigma = (json.loads((results / f"{name}.json").read_text()) for name in ("budget", "sigma"))
+    assert budget["cloth"].keys() == {"pcl"} and budget["cloth"]["pcl"]["run"]["seed"] == 1
+    assert budget["cloth"]["pcl"]["rmse_mean"] == pytest.approx(of_pcl, abs=1e-3)
+    assert sigma.keys() == {"cloth"} and sigma["cloth"].keys() == {"3"}
+    assert sigma["cloth"]["3"]["rmse_mean"] == pytest.approx(of_sigma, abs=1e-3)
+    write_sigma_table(preset, tmp_path, [3], steps=1)  # the same models: what the smaller budget has anyway
+    write_sigma_table(preset, tmp_path, [3], steps=2)
+    assert json.loads((results / "sigma_1.json").read_text()) == sigma and not (results / "sigma_2.json").exists()
+    for file in (tmp_path / "data" / "generated" / "smoke" / "queries").iterdir():  # as on another machine
+        file.unlink()
+    kept = read_results(preset, tmp_path)
+    assert kept == table
+    assert json.loads((results / "sigma.json").read_text()) == sigma
+    assert json.loads((results / "budget.json").read_text()) == budget
+    changed = dataclasses.replace(preset, train={**preset.train, "cloth": dataclasses.replace(cloth, steps=2)})
+    assert read_results(changed, tmp_path)["cloth"].keys() == {"sift"}
+
+
+def test_some_can_be_chosen_by_name(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    asked = []
+    monkeypatch.setattr(matrix, "run_tasks", lambda tasks, *_, **__: asked.extend(tasks) or iter(()))
+    monkeypatch.setattr("sys.argv", ["mmgsd.studies.matrix", "paper", "--only", "rope-spcl"])
+    matrix.main()
+    assert [(m.object, m.method) for m in asked] == [("rope", "spcl")] * 7
+    assert [m.steps for m in asked] == [4000, 1000, 1000, 1000, 4000, 4000, 3500]
+    monkeypatch.setattr("sys.argv", ["mmgsd.studies.matrix", "paper", "--only", "shirt"])
+    with pytest.raises(SystemExit):
+        matrix.main()
+    assert "'shirt'" in capsys.readouterr().err
+
+
+def read_results(preset: Preset, root: Path) -> dict[str, dict]:
+    write_tables(preset, root)
+    return json.loads((root / "data" / "results" / "smoke" / "rmse.json").read_text())
+
+
+def make_tiny(tiny_dataset: Callable[..., Path], root: Path) -> Preset:
+    for name in ("cloth", "rope"):
+        target = root / "data" / "generated" / "smoke" / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        tiny_dataset(object=name).rename(target)
+    return dataclasses.replace(SMOKE, evaluate=dataclasses.replace(SMOKE.evaluate, pairs=1, points=4))
+
+
+def test_a_cluster_gives_what_this_process_gives(tiny_dataset: Callable[..., Path], tmp_path: Path) -> None:
+    preset, root = make_tiny(tiny_dataset, tmp_path), tmp_path
+    models = [dataclasses.replace(configure_model(preset, name, "mmgsd"), steps=1) for name in ("cloth", "rope")]
+    how = {"n_workers": 1, "threads_per_worker": 1, "processes": False, "dashboard_address": "127.0.0.1:0"}
+    with LocalCluster(**how, silence_logs="ERROR") as cluster:
+        there = dict(run_tasks(models, preset, root, scheduler=cluster.scheduler_address))
+    for model in models:  # made by the cluster, so taken as they are
+        assert (root / "data" / "generated" / "smoke" / "models" / model.name / "weights.safetensors").is_file()
+    assert dict(run_tasks(models, preset, root)) == there
+    assert set(there) == {model.name for model in models}
+
+
+def test_what_a_model_starts_from_is_trained_before_it(tiny_dataset: Callable[..., Path], tmp_path: Path) -> None:
+    preset = make_tiny(tiny_dataset, tmp_path)
+    train = {"cloth": dataclasses.replace(preset.train["cloth"], steps=1, input_px=64), "rope": preset.train["rope"]}
+    preset = dataclasses.replace(preset, train=train)
+    table = configure_study(preset, "cloth", "main")
+    longer, finer, deeper = (table[name] for name in ("mmgsd_long", "mmgsd_fine", "mmgsd_fine_deep"))
+    models = tmp_path / "data" / "generated" / "smoke" / "models"
+    (_, rmse), *_ = run_tasks([deeper], preset, tmp_path)
+    assert all((models / model.name / "weights.safetensors").is_file() for model in (longer, finer, deeper))
+    how = {"n_workers": 2, "threads_per_worker": 1, "processes": False, "dashboard_address": "127.0.0.1:0"}
+    with LocalCluster(**how, silence_logs="ERROR") as cluster:
+        there = dict(run_tasks([longer, finer, deeper], preset, tmp_path, scheduler=cluster.scheduler_address))
+    assert there[deeper.name] == rmse
+
+
+@pytest.mark.parametrize(("words", "names"), [
+    ("--study robustness --only cloth", ["mmgsd", "mmgsd_workspace", "mmgsd_clutter", "mmgsd_heads"]),
+    ("--study shipped --only cloth", ["shipped"]),
+])  # fmt: skip
+def test_a_study_can_be_run_alone(words: str, names: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    chosen, paper = [], load_preset("paper")
+    monkeypatch.setattr(matrix, "run_tasks", lambda tasks, *_, **__: chosen.extend(tasks) or iter(()))
+    monkeypatch.setattr("sys.argv", ["matrix", "paper", *words.split()])
+    matrix.main()
+    assert chosen == list(configure_study(paper, "cloth", words.split()[1]).values())
+    assert list(configure_study(paper, "cloth", words.split()[1])) == names
+
+
+def test_a_study_can_be_run_at_a_smaller_budget(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    chosen, written = [], []
+    monkeypatch.setattr(matrix, "run_tasks", lambda tasks, *_, **__: chosen.extend(tasks) or iter([("one", 1.0)]))
+    monkeypatch.setattr(matrix, "_write_study", lambda models, paths, study: written.append(study))
+    monkeypatch.setattr("sys.argv", ["matrix", "quick", "--study", "robustness", "--steps", "7"])
+    matrix.main()
+    assert [model.steps for model in chosen] == [7] * 8 and written == ["robustness_7"]
+    assert [model.also for model in chosen[:4]] == ["", *["workspace_quick"] * 3]
+
+
+@pytest.mark.parametrize("words", ["--study fixes", "--study robustness --seeds 2"])
+def test_a_study_that_is_another_list_is_refused(
+    words: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.setattr("sys.argv", ["matrix", "paper", *words.split()])
+    with pytest.raises(SystemExit):
+        matrix.main()
+    assert "--study" in capsys.readouterr().err

@@ -1,0 +1,407 @@
+"""A wrong parameter stops a notebook in its first cells, by name; a right one may be spelled as papermill spells it."""
+
+from __future__ import annotations
+
+import ast
+import json
+import socket
+from pathlib import Path
+from typing import Any
+
+import nbformat
+import numpy as np
+import pytest
+from papermill.translators import PythonTranslator
+from PIL import Image
+
+from mmgsd.config import TrainConfig
+from mmgsd.learn.training import train_model
+from mmgsd.paths import Paths
+from mmgsd.studies import parameters
+from mmgsd.studies.parameters import (
+    check_images,
+    check_made,
+    find_file,
+    listed,
+    number,
+    one_of,
+    optional,
+    read_device,
+    read_parameters,
+    read_pixels,
+    read_scheduler,
+    whole,
+)
+
+ROOT = Path(__file__).resolve().parents[2]
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+CHECKED = [path for path in NOTEBOOKS if "read_parameters(globals()" in path.read_text()]
+PRESETS = "'smoke', 'quick', 'paper'"
+
+
+@pytest.fixture
+def empty_root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A repository where nothing is rendered or trained yet."""
+    root = tmp_path / "root"
+    (root / "data").mkdir(parents=True)
+    for name in ("objects", "weights", "sample"):
+        (root / "data" / name).symlink_to(ROOT / "data" / name)
+    monkeypatch.setenv("MMGSD_ROOT", str(root))
+    monkeypatch.chdir(tmp_path)
+    return root
+
+
+def run_first_cells(notebook: str, **injected: Any) -> dict[str, Any]:
+    """Run a notebook's imports, its parameters, those injected after them as papermill does, and the cell after."""
+    cells = [cell for cell in nbformat.read(ROOT / "notebooks" / f"{notebook}.ipynb", 4).cells if cell.source]
+    code = [cell for cell in cells if cell.cell_type == "code"][:3]
+    assert "parameters" in code[1].metadata.tags
+    sources = [cell.source for cell in code]
+    if injected:
+        sources.insert(2, PythonTranslator.codify(injected))
+    namespace: dict[str, Any] = {"In": [""]}
+    for source in sources:
+        plain = "\n".join(line for line in source.splitlines() if not line.startswith("%"))
+        namespace["In"].append(plain)
+        exec(compile(plain, notebook, "exec"), namespace)
+    return namespace
+
+
+def run_until_it_lacks_data(notebook: str, **injected: Any) -> dict[str, Any]:
+    """What a notebook makes of parameters: it goes on until it says what has to be run first, if anything."""
+    read: dict[str, Any] = {}
+    keep, original = read.update, parameters.read_parameters
+
+    def read_and_keep(namespace: dict, **readers: parameters.Reader) -> None:
+        original(namespace, **readers)
+        keep({name: namespace[name] for name in readers})
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(parameters, "read_parameters", read_and_keep)
+        try:
+            run_first_cells(notebook, **injected)
+        except ValueError as error:
+            assert "there is no data/" in str(error) or "there is no figures/" in str(error)
+    return read
+
+
+def list_assigned(source: str) -> list[str]:
+    return [statement.targets[0].id for statement in ast.parse(source).body]
+
+
+OF_NO_PRESET = ("your_images", "12_other_pictures")  # the latter shows what was measured on the images of two
+STAGES = [path.stem for path in NOTEBOOKS if path.stem[0].isdigit() and path.stem not in OF_NO_PRESET]
+SMOKE = {"preset": "smoke", "run": True}
+FLAGS = {
+    "01_render_data": ("run", "overwrite", "only_test"), "02_inspect_data": ("run",), "03_train": ("run", "overwrite"),
+    "04_evaluate": ("run", "overwrite"), "05_sigma_ablation": ("run", "overwrite"),
+    "06_uncertainty": ("run", "overwrite"), "07_figures": ("run",), "08_symmetry_study": ("run", "overwrite"),
+    "09_error_analysis": ("run",), "10_fold_by_demonstration": ("run",), "11_broken_symmetry": ("run", "overwrite"),
+    "run_all": ("overwrite",), "your_object": ("overwrite",),
+}  # fmt: skip
+WRONG = [  # notebook, parameter, what it was given, what the error says besides the parameter's name
+    *((path.stem, "preset", value, PRESETS) for path in CHECKED for value in ("papr", 3, None, ["quick"])
+      if path.stem not in OF_NO_PRESET),
+    *((notebook, flag, value, "must be true or false") for notebook, flags in FLAGS.items() for flag in flags
+      for value in ("flase", "", 2, None, [])),
+    ("01_render_data", "workers", -1, "from 0 to 1024, got -1"),
+    ("01_render_data", "workers", 1.5, "a whole number"),
+    ("01_render_data", "workers", "two", "a whole number"),
+    ("01_render_data", "workers", True, "a whole number"),
+    ("01_render_data", "workers", None, "a whole number"),
+    ("01_render_data", "scheduler", "localhost", "host:port"),
+    ("01_render_data", "scheduler", "tcp://localhost", "host:port"),
+    ("01_render_data", "scheduler", "tcp:/localhost:8786", "host:port"),
+    ("01_render_data", "scheduler", "localhost:0", "host:port"),
+    ("01_render_data", "scheduler", "localhost:99999", "host:port"),
+    ("01_render_data", "scheduler", 8786, "host:port"),
+    ("02_inspect_data", "images", 0, "from 1 on, got 0"),
+    ("02_inspect_data", "images", "many", "a whole number"),
+    ("02_inspect_data", "points", [], "from 1 to 4"),
+    ("02_inspect_data", "points", [0, 1, 2, 3, 4], "from 1 to 4"),
+    ("02_inspect_data", "points", [625], "from 0 to 624, got 625"),
+    ("02_inspect_data", "points", "[-1]", "from 0 to 624, got -1"),
+    ("02_inspect_data", "points", "a, b", "a whole number"),
+    ("02_inspect_data", "points", None, "a list"),
+    ("03_train", "device", "gpu", "'cpu'"),
+    ("03_train", "device", "cuda:99", "'cpu'"),
+    ("03_train", "device", 0, "'cpu'"),
+    ("04_evaluate", "drawn", ["sfit"], "did you mean 'sift'?"),
+    ("04_evaluate", "drawn", 3, "'sift'"),
+    ("04_evaluate", "drawn", {"sift": 1}, "a list"),
+    ("04_evaluate", "points", [0, 104, 208], "4, got"),
+    ("04_evaluate", "points", [0, 104, 208, 9999], "from 0 to 624, got 9999"),
+    ("05_sigma_ablation", "sigmas_px", [0], "greater than 0, got 0"),
+    ("05_sigma_ablation", "sigmas_px", [1.0, -4.0], "greater than 0, got -4.0"),
+    ("05_sigma_ablation", "sigmas_px", [float("nan")], "greater than 0, got nan"),
+    ("05_sigma_ablation", "sigmas_px", "wide", "greater than 0, got 'wide'"),
+    ("05_sigma_ablation", "sigmas_px", None, "a list"),
+    ("05_sigma_ablation", "steps", -1, "from 0 on, got -1"),
+    ("05_sigma_ablation", "steps", 0.5, "a whole number"),
+    ("05_sigma_ablation", "steps", float("inf"), "a whole number"),
+    ("06_uncertainty", "classical", ["surff"], "'sift'"),
+    ("06_uncertainty", "classical", None, "a list"),
+    ("08_symmetry_study", "groups", [], "from 1 on"),
+    ("08_symmetry_study", "groups", ["c5"], "'v4', 'c4', 'd4'"),
+    ("08_symmetry_study", "groups", "c4 own", "got 'own'"),
+    ("10_fold_by_demonstration", "task", "fold", "'edge'"),
+    ("10_fold_by_demonstration", "task", "ends", "'edge'"),
+    ("10_fold_by_demonstration", "target", 8, "from 0 to 7, got 8"),
+    ("11_broken_symmetry", "images", "quik", 'did you mean \'quick\'?), got \'quik\'; or "" for none'),
+    ("11_broken_symmetry", "images", 1, PRESETS),
+    ("09_error_analysis", "method", "mmgsdd", "did you mean 'mmgsd'?"),
+    ("09_error_analysis", "method", "sift", "'mmgsd', 'mmgsd_deep'"),
+    ("09_error_analysis", "method", None, "'mmgsd'"),
+    ("09_error_analysis", "objects", "cloth towel", "'cloth', 'rope'"),
+    ("09_error_analysis", "objects", "", "from 1 on"),
+    ("09_error_analysis", "objects", None, "from 1 on"),
+    ("09_error_analysis", "worst", 0, "from 1 on, got 0"),
+    ("your_images", "image0", "nowhere.jpg", "nowhere.jpg"),
+    ("your_images", "image1", "data/sample", "there is no file"),
+    ("your_images", "image1", "", "the path of a file"),
+    ("your_images", "image0", None, "the path of a file"),
+    ("your_images", "xy", [[485, 0]], "inside image0 of 485 x 485 px"),
+    ("your_images", "xy", [[-1, 80]], "inside image0 of 485 x 485 px"),
+    ("your_images", "xy", [], "[[column, row], …]"),
+    ("your_images", "xy", [[1, 2, 3]], "[[column, row], …]"),
+    ("your_images", "xy", [1, 2, 3], "[[column, row], …]"),
+    ("your_images", "xy", "left corner", "[[column, row], …]"),
+    ("your_images", "xy", None, "[[column, row], …]"),
+    ("your_images", "weights", "cloht", "did you mean 'cloth'?"),
+    ("your_images", "weights", None, "'cloth'"),
+    ("your_images", "min_confidence", 1.5, "from 0 to 1, got 1.5"),
+    ("your_images", "min_confidence", "half", "from 0 to 1, got 'half'"),
+    ("your_object", "name", "cloth", "'towel', 'tshirt'"),
+    ("your_object", "name", "t-shirt", "did you mean 'tshirt'?"),
+    ("your_object", "name", 1, "'towel', 'tshirt'"),
+    ("your_object", "start", "clotg", "did you mean 'cloth'?"),
+    ("your_object", "start", "nowhere/weights.safetensors", "there is no file"),
+    ("your_object", "start", 1, '"" for none'),
+]  # fmt: skip
+RIGHT = [  # notebook, parameter, as papermill or a person may write it, what the notebook goes on with
+    *((notebook, flag, text, value) for notebook, flags in FLAGS.items() for flag in flags
+      for text, value in (("false", False), ("No", False), ("0", False), ("true", True), ("on", True), (1, True))),
+    ("01_render_data", "workers", "8", 8),
+    ("01_render_data", "workers", 8.0, 8),
+    ("02_inspect_data", "images", "12", 12),
+    ("02_inspect_data", "points", "[0, 60]", [0, 60]),
+    ("02_inspect_data", "points", "0 60", [0, 60]),
+    ("02_inspect_data", "points", 60, [60]),
+    ("03_train", "device", "cpu", "cpu"),
+    ("03_train", "device", None, ""),
+    ("04_evaluate", "drawn", "sift,orb", ["sift", "orb"]),
+    ("04_evaluate", "drawn", "[]", []),
+    ("05_sigma_ablation", "sigmas_px", "[1, 4]", [1.0, 4.0]),
+    ("05_sigma_ablation", "sigmas_px", "1, 4", [1.0, 4.0]),
+    ("05_sigma_ablation", "sigmas_px", "4", [4.0]),
+    ("05_sigma_ablation", "steps", "1000", 1000),
+    ("06_uncertainty", "classical", "['sift', 'orb']", ["sift", "orb"]),
+    ("08_symmetry_study", "groups", "[c4, v4]", ["c4", "v4"]),
+    ("11_broken_symmetry", "images", "", ""),
+    ("11_broken_symmetry", "images", None, ""),
+    ("09_error_analysis", "objects", "cloth rope", ["cloth", "rope"]),
+    ("09_error_analysis", "objects", "cloth", ["cloth"]),
+    ("09_error_analysis", "objects", ["rope"], ["rope"]),
+    ("09_error_analysis", "worst", "8", 8),
+    ("your_images", "xy", "[[235, 80]]", [[235, 80]]),
+    ("your_images", "xy", "235,80", [[235, 80]]),
+    ("your_images", "xy", [[235, 80], [10.5, 20]], [[235, 80], [10.5, 20]]),
+    ("your_images", "min_confidence", "0.5", 0.5),
+    ("your_object", "start", "", ""),
+    ("your_object", "name", "towel", "towel"),
+]  # fmt: skip
+
+
+def name_case(value: Any) -> str | None:
+    return value if isinstance(value, str) and len(value) < 30 else repr(value)[:30]
+
+
+@pytest.mark.parametrize(("notebook", "parameter", "given", "said"), WRONG, ids=name_case)
+def test_a_wrong_parameter_is_refused_before_anything_is_touched(empty_root, notebook, parameter, given, said):
+    with pytest.raises(ValueError) as refused:
+        run_first_cells(notebook, **{parameter: given})
+    assert parameter in str(refused.value) and said in str(refused.value)
+    assert {path.name for path in (empty_root / "data").iterdir()} == {"objects", "weights", "sample"}
+
+
+@pytest.mark.parametrize(("notebook", "parameter", "given", "read"), RIGHT, ids=name_case)
+def test_a_right_one_is_read_as_what_it_means(empty_root, notebook, parameter, given, read):
+    got = run_until_it_lacks_data(notebook, **{parameter: given})[parameter]
+    assert got == read and type(got) is type(read)
+
+
+def test_every_notebook_checks_its_parameters():
+    assert {path.stem for path in NOTEBOOKS} - {path.stem for path in CHECKED} == set()
+
+
+@pytest.mark.parametrize("notebook", [path.stem for path in CHECKED])
+def test_a_mistyped_name_stops_every_notebook(empty_root, notebook):
+    with pytest.raises(ValueError, match="presett is no parameter of this notebook: one of '"):
+        run_first_cells(notebook, presett="quick")
+
+
+@pytest.mark.parametrize("notebook", [path.stem for path in CHECKED])
+def test_a_notebook_reads_all_of_its_parameters(empty_root, notebook):
+    cells = nbformat.read(ROOT / "notebooks" / f"{notebook}.ipynb", 4).cells
+    (tagged,) = (cell.source for cell in cells if "parameters" in cell.metadata.get("tags", ()))
+    assert sorted(run_until_it_lacks_data(notebook)) == sorted(list_assigned(tagged))
+
+
+STORED = "for preset='paper' there is no data/results/paper/"
+MISSING = [  # notebook, what it is told, what it asks for
+    ("02_inspect_data", SMOKE, "preset='smoke' there is no data/generated/smoke/cloth/dataset.json yet: run 01_"),
+    ("02_inspect_data", {}, "no figures/data/paper_variety.png yet: run 02_inspect_data with run=True for it first"),
+    ("03_train", SMOKE, "run 01_render_data with run=True for it first"),
+    ("03_train", {}, STORED + "runs.json yet: run 04_evaluate with run=True for it first"),
+    ("04_evaluate", SMOKE, "run 01_render_data with run=True for it first"),
+    ("04_evaluate", {}, STORED + "rmse.json yet: run 04_evaluate with run=True for it first"),
+    ("05_sigma_ablation", SMOKE, "run 01_render_data with run=True for it first"),
+    ("05_sigma_ablation", {"steps": 4000}, STORED + "sigma_4000.json yet: run 05_sigma_ablation with run=True"),
+    ("06_uncertainty", SMOKE, "run 01_render_data with run=True for it first"),
+    ("06_uncertainty", {}, STORED + "uncertainty.json yet: run 06_uncertainty with run=True for it first"),
+    ("07_figures", {"preset": "quick"}, "for preset='quick' there is no data/results/quick/figures_cloth.safetensors"),
+    ("08_symmetry_study", SMOKE, "run 01_render_data with run=True for it first"),
+    ("08_symmetry_study", {}, STORED + "symmetry.json yet: run 08_symmetry_study with run=True for it first"),
+    ("09_error_analysis", {**SMOKE, "objects": "rope"}, "smoke/rope/dataset.json yet"),
+    ("09_error_analysis", {"method": "spcl"}, STORED + "errors_spcl.json yet: run 09_error_analysis with run=True"),
+    ("10_fold_by_demonstration", {}, "paper/folding.json yet: run 10_fold_by_demonstration with run=True for it first"),
+    ("11_broken_symmetry", {}, STORED + "broken_symmetry.json yet: run 11_broken_symmetry with run=True for it first"),
+]
+
+
+@pytest.mark.parametrize(("notebook", "told", "said"), MISSING, ids=[case[0] for case in MISSING])
+def test_what_has_to_be_run_first_is_said(empty_root, notebook, told, said):
+    with pytest.raises(ValueError) as refused:
+        run_first_cells(notebook, **told)
+    assert said in str(refused.value)
+
+
+@pytest.mark.parametrize("notebook", STAGES)
+def test_what_is_committed_shows_the_papers_size_and_runs_nothing(notebook):
+    cells = nbformat.read(ROOT / "notebooks" / f"{notebook}.ipynb", 4).cells
+    (tagged,) = (cell.source for cell in cells if "parameters" in cell.metadata.get("tags", ()))
+    assert tagged.startswith('preset = "paper"  # ') and "\nrun = False  # True " in tagged
+
+
+def test_a_point_that_a_small_preset_does_not_ask_about_is_refused(empty_root):
+    said = r"points must be one of the points that the preset asks about \(0, 26, 52, … 624\), got 313"
+    with pytest.raises(ValueError, match=said):
+        run_first_cells("04_evaluate", preset="smoke", points=[0, 104, 208, 313])
+
+
+def render_nothing(root: Path, *splits: str) -> None:
+    """All that the checks look at of a rendered data set."""
+    for name in ("cloth", "rope"):
+        (root / "data" / "generated" / "smoke" / name).mkdir(parents=True)
+        file = root / "data" / "generated" / "smoke" / name / "dataset.json"
+        file.write_text(json.dumps({"images": dict.fromkeys(splits, 8)}))
+
+
+@pytest.mark.parametrize("notebook", ["03_train", "05_sigma_ablation", "08_symmetry_study"])
+def test_training_asks_for_the_images_that_were_left_out(empty_root, notebook):
+    render_nothing(empty_root, "test")
+    with pytest.raises(ValueError, match="no train images in .* for it with run=True, only_test=False first"):
+        run_first_cells(notebook, **SMOKE)
+    with pytest.raises(ValueError, match="run 01_render_data for it with run=True, only_test=False first"):
+        run_first_cells("02_inspect_data", **SMOKE)
+
+
+@pytest.mark.parametrize(
+    ("notebook", "told", "by"),
+    [
+        ("04_evaluate", {}, "run 03_train with run=True for it first"),
+        ("06_uncertainty", {}, "run 03_train with run=True for it first"),
+        ("09_error_analysis", {"method": "pcl"}, "for preset='smoke', method='pcl' there is no .*measure.matrix"),
+    ],
+)
+def test_a_method_that_is_not_trained_is_named(empty_root, notebook, told, by):
+    render_nothing(empty_root, "train", "test")
+    with pytest.raises(ValueError, match=by):
+        run_first_cells(notebook, **SMOKE, **told)
+
+
+def test_a_start_of_another_network_is_refused_before_rendering(empty_root, cloth_dataset):
+    config = TrainConfig(steps=1, batch=2, pairs=2, queries=4, input_px=64)
+    train_model(config, cloth_dataset, empty_root / "mine", device="cpu", progress=False)
+    with pytest.raises(ValueError, match="trunk_weights .* has roles 1, the training 2"):
+        run_first_cells("your_object", start="mine/weights.safetensors")
+
+
+def test_cells_of_a_persons_own_are_no_parameters():
+    cells = ["", "preset = 'smoke'", "mine = 3", "read_parameters(globals(), preset=…)"]
+    read_parameters({"In": cells, "preset": "smoke"}, preset=parameters.read_preset)
+    cells[2] = "presett = 'quick'\npreset = 'smoke'"
+    with pytest.raises(ValueError, match="presett is no parameter of this notebook: one of 'preset' .did you mean"):
+        read_parameters({"In": cells, "preset": "smoke"}, preset=parameters.read_preset)
+
+
+def test_a_parameter_that_is_not_set_is_named_and_none_is_changed():
+    namespace = {"a": "1"}
+    with pytest.raises(ValueError, match="b must be set in the cell of the parameters"):
+        read_parameters(namespace, a=whole(), b=whole())
+    with pytest.raises(ValueError, match="b must be a whole number"):
+        read_parameters(namespace := {"a": "1", "b": "x"}, a=whole(), b=whole())
+    assert namespace == {"a": "1", "b": "x"}
+
+
+@pytest.mark.parametrize(
+    ("reader", "given", "read"),
+    [
+        (whole(), np.int64(3), 3),
+        (number(), np.float32(0.5), 0.5),
+        (number(), 3, 3.0),
+        (listed(whole()), np.arange(3), [0, 1, 2]),
+        (listed(whole()), range(2), [0, 1]),
+        (listed(one_of(["a"])), "('a',)", ["a"]),
+        (optional(whole()), "", ""),
+        (read_pixels, (3, "4"), [[3.0, 4.0]]),
+        (read_pixels, np.array([[1, 2]]), [[1.0, 2.0]]),
+        (read_device, "", ""),
+    ],
+)
+def test_readers_take_what_python_and_a_shell_call_it(reader, given, read):
+    assert reader("it", given) == read
+
+
+@pytest.mark.parametrize(
+    ("reader", "given"),
+    [(whole(), "1e999"), (whole(), 10**400), (whole(), np.bool_(True)), (number(), "[1]"), (number(), 1j),
+     (listed(whole()), "[1, 2"), (listed(whole()), "[[1]]"), (listed(whole()), True), (one_of(["a"]), ["a"]),
+     (read_pixels, "[[1, 2], 3]"), (read_pixels, {1: 2}), (read_pixels, [["a", "b"]])],
+)  # fmt: skip
+def test_what_no_reader_takes_is_a_value_error_that_names_it(reader, given):
+    with pytest.raises(ValueError, match="it must be "):
+        reader("it", given)
+
+
+def test_a_scheduler_must_answer():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
+        assert read_scheduler("scheduler", address) == address
+    with pytest.raises(ValueError, match="scheduler must be the address of a scheduler that runs, got 'tcp://127"):
+        read_scheduler("scheduler", address)
+
+
+def test_a_path_starts_where_one_is_or_at_the_root(empty_root, tmp_path):
+    here, there, both = tmp_path / "here.txt", empty_root / "there.txt", "both.txt"
+    for path in (here, there, tmp_path / both, empty_root / both):
+        path.write_text("")
+    assert find_file("here.txt") == here and find_file(Path("there.txt")) == there
+    assert find_file("both.txt") == tmp_path / both
+    assert find_file(str(there)) == there
+    with pytest.raises(ValueError, match=f"image0 must be .*'none.txt'.* no file {tmp_path}/none.txt or {empty_root}/"):
+        find_file("none.txt", "image0")
+
+
+def test_your_images_are_found_from_either_place(empty_root, tmp_path):
+    Image.new("RGB", (300, 200)).save(tmp_path / "mine.png")
+    read = run_first_cells("your_images", image0="mine.png")
+    assert read["images"][0].shape == (200, 300, 3) and read["images"][1].shape == (485, 485, 3)
+
+
+def test_what_is_missing_is_told_by_its_place_in_the_repository(tmp_path):
+    paths = Paths(tmp_path, "quick")
+    check_made(paths, "x", [tmp_path])
+    with pytest.raises(ValueError, match="preset='quick', method='pcl' there is no data/generated/quick/cloth yet"):
+        check_made(paths, "x", [paths.dataset("cloth")], method="pcl")
+    check_images(paths, [])
