@@ -62,10 +62,10 @@ def test_the_traceback_is_to_be_had(monkeypatch):
 @pytest.mark.parametrize(
     ("command", "sentence"),
     [
-        ("measure.matrix papr", "error: preset must be one of 'smoke', 'quick', 'paper'"),
-        ("measure.matrix smoke --only shirt", "'shirt': no model or baseline of the preset smoke"),
-        ("measure.matrix smoke --scheduler localhost", "error: --scheduler must be an address host:port"),
-        ("measure.matrix smoke --only cloth-centre", "dataset.json does not exist"),
+        ("studies.matrix papr", "error: preset must be one of 'smoke', 'quick', 'paper'"),
+        ("studies.matrix smoke --only shirt", "'shirt': no model or baseline of the preset smoke"),
+        ("studies.matrix smoke --scheduler localhost", "error: --scheduler must be an address host:port"),
+        ("studies.matrix smoke --only cloth-centre", "dataset.json does not exist"),
         ("extras.sampling papr", "error: preset must be one of"),
         ("extras.sampling smoke --quality 0", "error: quality must be between 1 and 100, got 0"),
         ("extras.sampling smoke", "dataset.json does not exist"),

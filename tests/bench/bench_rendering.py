@@ -39,9 +39,9 @@ with silenced():
         from mmgsd.scene import blender, episode, randomize
     clock["start of Blender (once a process)"] = time.perf_counter() - begin
     timed(episode, "build_object", "shape (physics or geometry)")
-    timed(render, "build_bvh", "labels: tree")
-    timed(render, "find_visible", "labels: ray casts")
-    timed(render, "render_image", "Cycles and denoiser")
+    timed(blender, "build_bvh", "labels: tree")
+    timed(blender, "find_visible", "labels: ray casts")
+    timed(blender, "render_image", "Cycles and denoiser")
     timed(randomize, "draw_object_material", "materials")
     timed(randomize, "draw_background", "materials")
     views, config = [], RenderConfig(object=sys.argv[1], seed=int(sys.argv[2]))

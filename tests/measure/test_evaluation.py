@@ -15,7 +15,7 @@ import torch
 from mmgsd.config import EvaluateConfig, TrainConfig
 from mmgsd.dataset import Dataset, load_dataset
 from mmgsd.match.matcher import Matcher
-from mmgsd.match.mixture import Mixture, Reading
+from mmgsd.match.mixture import AS_IT_IS, Mixture, Reading
 from mmgsd.measure import evaluation, questions
 from mmgsd.measure.evaluation import (
     BASELINES,
@@ -276,7 +276,7 @@ def test_of_further_modes_the_most_probable_one_is_the_answer(
 
 
 def test_a_point_that_sticks_out_of_the_image_is_asked_at_its_border(cloth_dataset: Path) -> None:
-    answer = evaluation._classical_answer("sift", load_dataset(cloth_dataset, "test"))
+    answer = evaluation._classical_answer("sift", load_dataset(cloth_dataset, "test"), AS_IT_IS)
     xy, four = np.float32([[-2.5, 120], [-0.5, 120]]), np.array([4, 4])
     outside, border = answer(0, 1, xy, four)[0].modes
     torch.testing.assert_close(outside, border)

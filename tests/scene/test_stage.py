@@ -207,7 +207,7 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     asked: list[str] = []
     monkeypatch.setattr(stage, "IMAGES_A_BATCH", 1)
 
-    def draw(job: dict, folder: Path) -> tuple[int, str]:
+    def draw(job: dict, folder: Path, *, module: str) -> tuple[int, str]:
         asked.append(job["split"])
         return run_child(job, folder)
 
@@ -308,7 +308,7 @@ def test_batches_are_known_again_by_their_marks_where_the_claim_is_damaged(
 
 
 def test_a_killed_child_is_said_to_be_killed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stage, "run_child", lambda job, folder: (-signal.SIGKILL, ""))
+    monkeypatch.setattr(stage, "run_child", lambda job, folder, module: (-signal.SIGKILL, ""))
     with pytest.raises(RenderError, match="ended by SIGKILL: memory may be short, so try fewer workers"):
         render_batch(next(iter(plan_batches(CONFIG).values())))
 
@@ -330,7 +330,7 @@ def test_stopping_says_what_is_kept_and_the_next_call_goes_on(
 def test_nothing_listens_beyond_this_machine_while_it_renders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     listening: set[str] = set()
 
-    def look(job: dict, folder: Path) -> tuple[int, str]:
+    def look(job: dict, folder: Path, *, module: str) -> tuple[int, str]:
         there = psutil.Process().net_connections("inet")
         listening.update(c.laddr.ip for c in there if c.status == psutil.CONN_LISTEN)
         return run_child(job, folder)
