@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
@@ -13,10 +13,13 @@ import hypothesis
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 
 from mmgsd.config import DEFAULT_GROUP, IMAGE_SIZE
 from mmgsd.dataset_format import FORMAT
 from mmgsd.images import encode_image, encode_mask
+from mmgsd.model import dinov2
+from mmgsd.model.tensors import write_tensors
 from mmgsd.symmetry import GRID_GROUPS, LINE_GROUPS, load_group, load_mirror
 
 os.environ.setdefault("MPLBACKEND", "Agg")  # no window, and before anything imports matplotlib
@@ -30,6 +33,25 @@ LONGEST = "test_run_all.py"
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The longest file first: where processes share the files, none is left with it at the end."""
     items.sort(key=lambda item: item.path.name != LONGEST)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def backbone(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """A frozen backbone of random weights where the published one, which is no part of a clone, is not at hand."""
+    if (dinov2.find_shipped() / dinov2.FILE).is_file():
+        yield
+        return
+    path = tmp_path_factory.mktemp("backbone") / "random.safetensors"
+
+    def find() -> Path:
+        if not path.is_file():
+            torch.manual_seed(0)
+            write_tensors(path, {k: v.half() for k, v in dinov2.VisionTransformer().state_dict().items()}, {})
+        return path
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(dinov2, "find_backbone", find)
+        yield
 
 
 @pytest.fixture

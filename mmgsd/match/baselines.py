@@ -29,7 +29,8 @@ from mmgsd.match.mixture import AS_IT_IS, Reading, check_modes
 from mmgsd.numerics import own_numerics
 
 EXTRACTORS: dict[str, Extractor] = {"imagenet": extract_imagenet, "dinov2": extract_dinov2}
-BASELINES = ("sift", "orb", "akaze", "daisy", *EXTRACTORS)
+BASELINES = ("sift", "orb", "akaze", "daisy", "imagenet")
+OPTIONAL = ("dinov2",)  # whose weights are no part of a clone: `mmgsd.extras.backbones` makes the file
 BINARY = ("orb", "akaze")  # compared by Hamming distance
 STRIDE_PX = 16  # between the candidates on the object: about a cell of the trained networks
 SHARPNESS = 2.0  # logits fall by this where the squared distance grows by its std over the object
@@ -97,10 +98,10 @@ class FeatureMatcher:
 
 
 class BaselineMatcher(FeatureMatcher):
-    """The same of a method in `BASELINES`; ValueError for one not at hand."""
+    """The same of a method in `BASELINES` or `OPTIONAL`; ValueError for one not at hand."""
 
     def __init__(self, method: str, *, modes: int = 1, reading: Reading = AS_IT_IS) -> None:
-        check_choice("method", method, BASELINES)
+        check_choice("method", method, (*BASELINES, *OPTIONAL))
         super().__init__(EXTRACTORS.get(method, extract_imagenet), modes=modes, reading=reading)
         self.method = method
 
@@ -146,7 +147,7 @@ def compute_descriptors(image: np.ndarray, xy: np.ndarray, *, method: str) -> np
 
     Raises ValueError for another image, an unknown method, or one that the installed OpenCV lacks.
     """
-    check_choice("method", method, BASELINES)
+    check_choice("method", method, (*BASELINES, *OPTIONAL))
     _check_image("image", image)
     xy = check_pixels(xy, image.shape[1::-1], image="the image")
     if method in EXTRACTORS:

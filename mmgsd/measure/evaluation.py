@@ -16,7 +16,7 @@ from mmgsd.config import EvaluateConfig, digest
 from mmgsd.dataset import Dataset, load_dataset
 from mmgsd.dataset_format import UNREADABLE
 from mmgsd.files import DamagedFileError, read_json, saying_what_stays, set_aside, write_json, writing
-from mmgsd.match.baselines import BASELINES, BaselineMatcher
+from mmgsd.match.baselines import BASELINES, OPTIONAL, BaselineMatcher
 from mmgsd.match.matcher import Matcher, check_scales, read_heatmap
 from mmgsd.match.mixture import AS_IT_IS, Mixture, Reading, check_modes
 from mmgsd.measure.metrics import aggregate
@@ -71,7 +71,7 @@ def evaluate_baseline(
 
     ``reading`` of the descriptors' modes.
     """
-    if method not in BASELINES + CHANCE:
+    if method not in BASELINES + OPTIONAL + CHANCE:
         raise ValueError(f"method must be one of {BASELINES + CHANCE}, got {method!r}")
     overwrite, progress = read_flag("overwrite", overwrite), read_flag("progress", progress)
     out = Path(out)

