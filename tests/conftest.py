@@ -36,10 +36,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def backbone(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """A frozen backbone of random weights where the published one, which is no part of a clone, is not at hand."""
+def backbone(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[], Path]]:
+    """A frozen backbone of random weights where the published one, which is no part of a clone, is not at hand.
+
+    It is what found the published one.
+    """
+    published = dinov2.find_backbone
     if (dinov2.find_shipped() / dinov2.FILE).is_file():
-        yield
+        yield published
         return
     path = tmp_path_factory.mktemp("backbone") / "random.safetensors"
 
@@ -51,7 +55,7 @@ def backbone(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(dinov2, "find_backbone", find)
-        yield
+        yield published
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@
 
 import dataclasses
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -58,7 +59,10 @@ def test_no_model_holds_or_trains_the_backbone(images: torch.Tensor) -> None:
                and "surface" not in name)  # fmt: skip
 
 
-def test_a_missing_and_a_damaged_backbone_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_and_a_damaged_backbone_are_named(
+    backbone: Callable[[], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(dinov2, "find_backbone", backbone)
     monkeypatch.setattr(dinov2, "find_shipped", lambda: tmp_path)
     device = torch.device("cpu")
     with pytest.raises(FileNotFoundError, match=r"dinov2s\.safetensors.*mmgsd\.extras\.backbones"):
