@@ -17,9 +17,8 @@ PANELS = (  # a title, what is measured there, and times what
     ("Cluttered renders", "workspace", "rmse_mean", 1.0, "RMSE (px)"),
     ("Photographs", "photographs", "found@5%", 100.0, "Corners, ends found (%)"),
 )
-COLOURS = {"": get_colour("shipped"), "paper": get_colour("mmgsd")} | {
-    name: get_colour(name) for name in (*BASELINES, *OPTIONAL)
-}
+COLOURS = {"": get_colour("shipped"), "paper": get_colour("mmgsd")}
+COLOURS |= {name: get_colour(name) for name in (*BASELINES, *OPTIONAL)}
 LABELS = {"": "MMGSD, shipped", "paper": "MMGSD, clean images only"}
 
 
@@ -27,7 +26,7 @@ LABELS = {"": "MMGSD, shipped", "paper": "MMGSD, clean images only"}
 def plot_robustness(rows: Rows) -> Figure:
     """A panel for clean renders, cluttered ones and photographs: a bar for each model and baseline of each object.
 
-    ``rows`` as `mmgsd.measure.shipped` stores them; what was not measured has no bar. ValueError of no row.
+    ``rows`` as `mmgsd.studies.shipped` stores them; what was not measured says so. ValueError of no row.
     """
     check_filled("rows", rows)
     names = [name for object in OBJECTS for name in list_names(rows, object)]
@@ -54,6 +53,7 @@ def _label(name: str) -> str:
 
 def _draw_bar(axis: Axes, place: float, name: str, value: float | None) -> None:
     if value is None:
+        axis.annotate("not measured", (0, place), xytext=(2, 0), textcoords="offset points", va="center", fontsize=5.5)
         return
     axis.barh(place, value, height=0.72, color=COLOURS[name.partition("@")[0].partition("-")[2]])
     axis.annotate(f"{value:.0f}", (value, place), xytext=(2, 0), textcoords="offset points", va="center", fontsize=6.5)
