@@ -17,8 +17,8 @@ The first of the five that is there counts. Each place of `SOURCES` photographs,
 only those with all corners), is asked for in every other photograph with places:
 
     found@5%, found@10%   share of the marked places that have a mode nearer than 5, 10 % of the object's size
-    spurious              share of the k modes most probably seen (`Match.seen_first`), k the marked places, farther
-                          than 10 % from all of them
+    spurious              share of the k modes most probably seen (`Match.seen_first`; the surest ones where that is not
+                          known), k the marked places, farther than 10 % from all of them
     best                  distance of `Match.best` to the nearest marked place, % of the size; of answers that give one
 
 Of a cloth's corners and a rope's ends all but the last is also counted of `Matcher.find`, "by_name": there no other
