@@ -234,6 +234,8 @@ QUICK = dict(
     rope={"input_px": 128, "steps": 270}, ablation={"steps": 60}, sigmas=(1.0, 4.0, 16.0),
     evaluate={"pairs": 30, "points": 625}, cluttered="workspace_quick",
 )  # fmt: skip
+ROUNDS = 5  # stretches of the shipped models' training, each on new images
+ROUND = {**PAPER, "train_images": 600, "test_images": 10}
 PRESETS = {
     "smoke": _preset(
         "smoke",
@@ -247,6 +249,10 @@ PRESETS = {
     "workspace": _preset("workspace", **PAPER, scene="workspace"),
     "workspace_quick": _preset("workspace_quick", **QUICK, scene="workspace"),
 }  # fmt: skip
+for _number in range(1, ROUNDS + 1):
+    _clean, _cluttered = f"round{_number}", f"round{_number}_workspace"
+    PRESETS[_clean] = _preset(_clean, **ROUND, seed=_number, cluttered=_cluttered)
+    PRESETS[_cluttered] = _preset(_cluttered, **ROUND, seed=_number, scene="workspace")
 
 
 def digest(config: Config) -> str:

@@ -37,10 +37,11 @@ from mmgsd.learn.objective import compute_head_loss, compute_loss
 from mmgsd.learn.optimiser import make_optimisers
 from mmgsd.learn.prototypes import compute_prototype_loss, make_prototypes
 from mmgsd.match.matcher import Matcher, load
-from mmgsd.measure.calibration import calibrate_bandwidth, calibrate_modes, calibrate_temperature
+from mmgsd.measure.calibration import calibrate_bandwidth, calibrate_modes, calibrate_temperature, describe_places
 from mmgsd.measure.questions import measure_rmse
 from mmgsd.model.network import build_network, find_device, name_hardware, sample_descriptors
 from mmgsd.model.tensors import WEIGHTS, write_tensors
+from mmgsd.model.weights import PLACES
 from mmgsd.numerics import own_numerics
 from mmgsd.progress import ProgressBar
 
@@ -124,11 +125,14 @@ class _Run:
         self.permutations = torch.tensor(known, device=device)
         self.images = load_training_images(self.data, config.input_px)
         torch.manual_seed(config.seed)
-        self.network = _make_network(config, folder.parent).to(device, memory_format=torch.channels_last)
+        network, places = _make_network(config, folder.parent)
+        self.network = network.to(device, memory_format=torch.channels_last)
         # the average of the last steps' weights, statistics of batch normalisation included, is what is kept
         average = get_ema_multi_avg_fn(1 - 1 / max(2.0, config.steps / 50))
         self.average = AveragedModel(self.network, multi_avg_fn=average, use_buffers=True)
-        start = make_prototypes(self.data.xy, known, config.descriptor_dim, math.hypot(*data.size))
+        start = places  # as the descriptors that the training goes on with lie
+        if start is None or start.shape != (data.n_points, config.descriptor_dim):
+            start = make_prototypes(self.data.xy, known, config.descriptor_dim, math.hypot(*data.size))
         self.prototypes = torch.nn.Parameter(start.to(device))
         self.trained = [p for p in self.network.parameters() if p.requires_grad]
         self.optimisers = make_optimisers(self.network, [self.prototypes], config)
@@ -286,7 +290,8 @@ class _Run:
         calibration = calibrate_modes(matcher, self.held_out)
         if calibration is not None:
             metadata["calibration"] = calibration.to_json()
-        write_tensors(weights, self.average.module.state_dict(), metadata)
+        places = describe_places(matcher, self.held_out).cpu()
+        write_tensors(weights, {**self.average.module.state_dict(), PLACES: places}, metadata)
         (self.folder / CHECKPOINT).unlink(missing_ok=True)
         return weights
 
@@ -312,9 +317,12 @@ def check_start(config: TrainConfig, models: Path) -> None:
     _make_network(config, models)
 
 
-def _make_network(config: TrainConfig, models: Path) -> torch.nn.Module:
-    """The network as training starts from it; ``models`` is the folder of the models trained beside it."""
-    start, beside = config.trunk_weights, models / config.trunk_weights / WEIGHTS
+def _make_network(config: TrainConfig, models: Path) -> tuple[torch.nn.Module, Tensor | None]:
+    """The network as training starts from it, and the object's places if the weights it goes on from know them.
+
+    ``models`` is the folder of the models trained beside it.
+    """
+    start, beside, places = config.trunk_weights, models / config.trunk_weights / WEIGHTS, None
     start = str(beside) if start and beside.is_file() else start
     parts = {"roles": config.roles, "heads": config.heads, "trunk_weights": start}
     network = build_network(config.network, config.descriptor_dim, **parts)
@@ -326,7 +334,8 @@ def _make_network(config: TrainConfig, models: Path) -> torch.nn.Module:
             if theirs != ours and not within:
                 raise ValueError(f"trunk_weights {start!r} has {name} {theirs!r}, the training {ours!r}")
         network.start_from(trained.network)
-    return network
+        places = trained.places
+    return network, places
 
 
 def _cosine(progress: float) -> float:

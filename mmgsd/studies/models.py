@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from mmgsd.checks import check_choice
-from mmgsd.config import OBJECTS, Preset, RenderConfig, TrainConfig
+from mmgsd.config import OBJECTS, ROUNDS, Preset, RenderConfig, TrainConfig
 
 CHANCE_STYLES = {"centre": "--", "random": ":"}
 ABOVE = {"unimodal": (0, (4, 2)), "pcl": (0, (4, 2))}  # dashed, on the lines that they lie on: MMGSD's, SPCL's
@@ -50,6 +50,7 @@ def by_object(**values: float) -> Rule:
 
 
 ITS_OWN = Rule("the weights of what it starts from", lambda start, _: start.name)
+LAST_ROUND = Rule("the weights of the round before", lambda start, _: f"{start.object}-round{start.seed}")
 PAPER_ONLY = Rule("the shipped weights of the paper's images", lambda start, _: f"{start.object}-paper")
 
 
@@ -125,7 +126,11 @@ MODELS = (
           {"network": "lite0x2fine", "optimiser": "muon", "input_px": times(2), "roundness": 0.05, "heads": True,
            "clutter": True, "also": "workspace"}, ("backbones",), "EfficientNet-Lite0"),
     Model("dinov2s", "DINOv2 ViT-S/14, frozen", "light", {"network": "dinov2s"}, ("backbones",), "DINOv2 ViT-S"),
-    Model("recipe", "MMGSD, one recipe, until done", "light", {"steps": 20000}, ("recipe",), "MMGSD, done"),
+    # the shipped models' training: stretches of new images each, the first from the backbone's weights
+    Model("round1", "MMGSD, round 1", "light", {"seed": 1}, ("rounds",)),
+    *(Model(f"round{n}", f"MMGSD, round {n}", f"round{n - 1}",
+            {"seed": n, "trunk_weights": LAST_ROUND, "learning_rate": 1e-3, "sigma_start_px": 8.0}, ("rounds",))
+      for n in range(2, ROUNDS + 1)),
     # what each part of the shipped models' training brings, one after another
     Model("mmgsd_workspace", "MMGSD, workspace renders too", "mmgsd", {"also": "workspace"}, ("robustness",),
           "+ workspace"),
@@ -148,7 +153,7 @@ SHIPPED = {"shipped": "", "mmgsd": "-paper", "spcl": "-spcl"}  # row: what its f
 SMALL = ("symmetry", "budget", "sigma", "fixes", "robustness", "backbones")  # studies of the equal, smaller budget
 RUN = ("first", "symmetry", "budget", "sigma", "main")  # studies that are run unless one is named, in this order
 # on a preset's own images and one seed: not "fixes" and "seeds"
-STUDIES = (*RUN, "robustness", "backbones", "recipe", "shipped")
+STUDIES = (*RUN, "robustness", "backbones", "shipped")
 
 
 def list_rows(study: str) -> list[Model]:
