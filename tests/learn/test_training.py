@@ -32,6 +32,7 @@ from mmgsd.learn.training import (
 )
 from mmgsd.match.matcher import Matcher
 from mmgsd.model.tensors import WEIGHTS, load_metadata
+from mmgsd.model.weights import PLACES
 
 TINY = TrainConfig(steps=3, batch=4, pairs=6, queries=16, input_px=64, descriptor_dim=8)
 ONE_STEP, LONGER = dataclasses.replace(TINY, steps=1), dataclasses.replace(TINY, steps=4)
@@ -190,8 +191,26 @@ def test_training_starts_from_trained_weights(cloth_dataset: Path, tmp_path: Pat
     beside = load_file(train(dataclasses.replace(config, trunk_weights="first"), cloth_dataset, tmp_path / "third"))
     assert all(torch.equal(went_on[name], value) for name, value in beside.items())
     for name, value in load_file(first).items():
-        if not name.endswith(("running_mean", "running_var", "num_batches_tracked")):
+        if not name.endswith(("running_mean", "running_var", "num_batches_tracked", PLACES)):
             torch.testing.assert_close(went_on[name], value, rtol=0, atol=1e-6)
+
+
+def test_dense_supervision_goes_on_from_the_places_of_trained_weights(cloth_dataset: Path, tmp_path: Path) -> None:
+    first = train(ONE_STEP, cloth_dataset, tmp_path / "first")
+    config = dataclasses.replace(ONE_STEP, trunk_weights="first", learning_rate=1e-9)
+    kept = {}
+
+    class Kept(training._Run):
+        def finish(self, weights: Path) -> Path:
+            kept["prototypes"] = self.prototypes.detach()
+            return super().finish(weights)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(training, "_Run", Kept)
+        train(config, cloth_dataset, tmp_path / "second")
+    places = load_file(first)[PLACES]
+    assert places.shape == (625, 8)
+    torch.testing.assert_close(kept["prototypes"], places, rtol=0, atol=1e-6)
 
 
 def test_a_deeper_network_starts_from_a_shallower_one(cloth_dataset: Path, tmp_path: Path) -> None:

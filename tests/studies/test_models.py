@@ -107,7 +107,7 @@ def test_every_row_comes_to_a_training_of_its_objects(preset: str) -> None:
 def test_names_are_unique_and_starts_are_rows() -> None:
     assert len(ROWS) == len(MODELS) + len(UNTRAINED)
     assert {row.start for row in MODELS} <= {PRESET, *ROWS}
-    assert {study for row in MODELS for study in row.studies} | {"sigma"} == {*STUDIES, "fixes", "seeds"}
+    assert {study for row in MODELS for study in row.studies} | {"sigma"} == {*STUDIES, "fixes", "rounds", "seeds"}
 
 
 def test_everything_that_a_figure_may_draw_has_a_colour_of_its_own() -> None:
