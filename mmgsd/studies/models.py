@@ -127,7 +127,7 @@ MODELS = (
            "clutter": True, "also": "workspace"}, ("backbones",), "EfficientNet-Lite0"),
     Model("dinov2s", "DINOv2 ViT-S/14, frozen", "light", {"network": "dinov2s"}, ("backbones",), "DINOv2 ViT-S"),
     # the shipped models' training: stretches of new images each, the first from the backbone's weights
-    Model("round1", "MMGSD, round 1", "light", {"seed": 1}, ("rounds",)),
+    Model("round1", "MMGSD, round 1", "light", {"seed": 1, "steps": by_object(cloth=4000, rope=3000)}, ("rounds",)),
     *(Model(f"round{n}", f"MMGSD, round {n}", f"round{n - 1}",
             {"seed": n, "trunk_weights": LAST_ROUND, "learning_rate": 1e-3, "sigma_start_px": 8.0}, ("rounds",))
       for n in range(2, ROUNDS + 1)),
