@@ -12,9 +12,9 @@ import importlib.util
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from mmgsd.studies.registry import get_study, list_studies, open_study, run_study
+    from mmgsd.studies.registry import get_study, list_studies, open_study, run_study, save_figures
 
-__all__ = ["get_study", "list_studies", "open_study", "run_study"]
+__all__ = ["get_study", "list_studies", "open_study", "run_study", "save_figures"]
 
 
 def __getattr__(name: str) -> Any:

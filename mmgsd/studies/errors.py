@@ -71,7 +71,7 @@ def run(paths: Paths, *, method: str = "mmgsd", objects: Sequence[str] = OBJECTS
 
     Of another method than MMGSD these files have its name. An object that is left out stays in them.
     """
-    (name_errors, name_entropy), suffix = name_results(method=method), "" if method == "mmgsd" else f"_{method}"
+    suffix = _get_suffix(method)
     tables, explained, nats = {}, {}, {}
     for name, model in list_models(paths.preset, method, objects).items():
         data = load_dataset(paths.dataset(name), "test")
@@ -80,20 +80,24 @@ def run(paths: Paths, *, method: str = "mmgsd", objects: Sequence[str] = OBJECTS
         sheet = plot_worst_queries(tables[name], data, Matcher.load(paths.model(model) / WEIGHTS), count=worst)
         save_figure(sheet, paths.figures / f"worst_{name}{suffix}", kinds=("jpg",))
     save_figure(plot_error_analysis(tables), paths.figures / f"error_analysis{suffix}")
-    for name, found in ((name_entropy, nats), (name_errors, explained)):
-        file = paths.results / f"{name}.json"
-        write_results(read_results(file) | found, file)
-    return file
+    file, other = (paths.results / f"{name}{suffix}.json" for name in ("errors", "entropy"))
+    write_results(read_results(other) | nats, other)
+    return write_results(read_results(file) | explained, file)
 
 
-def name_results(*, method: str = "mmgsd", **_: Any) -> list[str]:
-    """The results files of a method's errors, and of its entropies."""
-    return [name if method == "mmgsd" else f"{name}_{method}" for name in ("errors", "entropy")]
+def _get_suffix(method: str) -> str:
+    """What the names of a method's files end with."""
+    return "" if method == "mmgsd" else f"_{method}"
+
+
+def list_shown(paths: Paths, *, method: str = "mmgsd", **_: Any) -> list[Path]:
+    """The results file of a method's errors."""
+    return [paths.results / f"errors{_get_suffix(method)}.json"]
 
 
 def list_figures(paths: Paths, *, method: str = "mmgsd", objects: Sequence[str] = OBJECTS) -> list[Path]:
     """Those of a method's figures that are there: of some methods the repository holds the numbers alone."""
-    suffix = "" if method == "mmgsd" else f"_{method}"
+    suffix = _get_suffix(method)
     names = [f"error_analysis{suffix}.png", *(f"worst_{name}{suffix}.jpg" for name in objects)]
     return [path for path in map(paths.figures.joinpath, names) if path.is_file()]
 
@@ -270,7 +274,7 @@ def plot_worst(matches: Sequence[Match], true: Sequence[np.ndarray], errors_px: 
 
 
 STUDY = Study(
-    "errors", 90, run, check, "09_error_analysis", ("errors", "entropy"), lambda **how: name_results(**how)[:1],
+    "errors", 90, run, check, "09_error_analysis", ("errors", "entropy"), list_shown,
     tables={"errors": Shown("paper/errors.json", describe_difficulties, "errors_table")},
     claims=(judge_hidden,),
     findings=(

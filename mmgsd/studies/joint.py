@@ -47,5 +47,7 @@ def make_joint_sentence(rows: Mapping[str, Mapping[str, Any]]) -> str:
     return f"{asked} questions. A joint answer takes up to {cost} ms more than one that is not ({hardware})."
 
 
-STUDY = Study("joint", 130, run, tables={"joint": Shown(RESULTS, describe_joint),
-                                         "joint_counts": Shown(RESULTS, make_joint_sentence)})  # fmt: skip
+STUDY = Study(
+    "joint", 130, run, shows=lambda paths, **_: [paths.results.parent / RESULTS],
+    tables={"joint": Shown(RESULTS, describe_joint), "joint_counts": Shown(RESULTS, make_joint_sentence)},
+)  # fmt: skip

@@ -103,9 +103,14 @@ def run(
     return paths.results / "rmse.json"
 
 
+def list_drawn(results: Path) -> dict[str, Path]:
+    """{object: the file that figures are drawn from} of a preset's folder of results."""
+    return {name: results / f"figures_{name}.safetensors" for name in OBJECTS}
+
+
 def load_drawn(results: Path) -> dict[str, FigureData]:
     """{object: what the figures are drawn from} of a preset's folder of results."""
-    return {name: load_figure_data(results / f"figures_{name}.safetensors") for name in OBJECTS}
+    return {name: load_figure_data(path) for name, path in list_drawn(results).items()}
 
 
 def describe_main(results: Results, *, methods: Iterable[str] = tuple(LABELS)) -> Table:
@@ -187,13 +192,17 @@ def draw_teaser(results: Path) -> Figure:
     return plot_teaser({name: [figure_data.ask_plain(load_shipped(name), load_sample(root, name))] for name in OBJECTS})
 
 
-def draw_combined(results: Path) -> Figure:
-    """`plot_combined` of the query of the example about which the methods' errors differ most."""
-    drawn = load_drawn(results)
+def compare_answers(drawn: Mapping[str, FigureData]) -> tuple[dict[str, dict[str, Match]], dict[str, np.ndarray]]:
+    """{object: {method: answer}} and true matches of the example's query about which the errors differ most."""
     query = {name: figure_data.choose_contrast(data) for name, data in drawn.items()}
     compared = {name: {m: match[query[name]] for m, match in data.answers.items()} for name, data in drawn.items()}
-    true = {name: data.true[query[name]] for name, data in drawn.items()}
-    return plot_combined(compared, true, {name: data.answers["mmgsd"] for name, data in drawn.items()})
+    return compared, {name: data.true[query[name]] for name, data in drawn.items()}
+
+
+def draw_combined(results: Path) -> Figure:
+    """`plot_combined` of `compare_answers`."""
+    drawn = load_drawn(results)
+    return plot_combined(*compare_answers(drawn), {name: data.answers["mmgsd"] for name, data in drawn.items()})
 
 
 def draw_rmse_pdf(results: Path) -> Figure:
@@ -330,6 +339,7 @@ def compute_density(histogram: np.ndarray, step: float, *, bandwidth: float = 1.
 
 STUDY = Study(
     "main", 10, run, check, "04_evaluate", ("rmse",),
+    lambda paths, **_: [paths.results / "rmse.json", *list_drawn(paths.results).values()],
     tables={
         "headline": Shown("paper/rmse.json", partial(describe_main, methods=HEADLINE)),
         "paper": Shown("paper/rmse.json", describe_main, "main_table"),

@@ -22,10 +22,9 @@ ENDS = 0.1  # of a rope's length at each end, its extremities; the middle is the
 COMMAND = "`04_evaluate`, `07_figures`"
 
 
-def measure_all(folder: Path, found: Results) -> dict[str, Any]:
+def measure_all(folder: Path, found: Results | None = None) -> dict[str, Any]:
     """``places``, ``peaks`` {object: `measure_places`, `count_peaks`} of a preset's data of figures, where it is."""
-    drawn = {name: folder / f"figures_{name}.safetensors" for name in OBJECTS}
-    drawn = {name: path for name, path in drawn.items() if path.is_file()}
+    drawn = {name: path for name, path in main.list_drawn(folder).items() if path.is_file()}
     places = {name: measure_places(path, name) for name, path in drawn.items()}
     return {"places": places, "peaks": {n: count_peaks(path) for n, path in drawn.items()}} if drawn else {}
 
@@ -85,6 +84,7 @@ def judge_bimodal(results: Results) -> Claim:
 
 
 STUDY = Study(
-    "places", 50, main.run, main.check, "07_figures", derive=measure_all,
+    "places", 50, main.run, main.check, "04_evaluate", derive=measure_all,
+    shows=lambda paths, **_: list(main.list_drawn(paths.results).values()),
     tables={"places": Shown("paper", describe_places)}, claims=(judge_interior, judge_bimodal),
 )  # fmt: skip

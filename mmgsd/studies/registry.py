@@ -15,13 +15,15 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import pandas as pd
+
 import mmgsd.studies
 from mmgsd.checks import check_choice
 from mmgsd.config import Preset, load_preset
 from mmgsd.files import DamagedFileError, read_json
 from mmgsd.paths import Paths, find_root
 from mmgsd.studies.claims import Claim
-from mmgsd.studies.parameters import check_stored
+from mmgsd.studies.parameters import check_made
 from mmgsd.studies.table import Table, to_markdown
 
 if TYPE_CHECKING:
@@ -89,13 +91,17 @@ class Study:
     check: Callable[..., None] = check_nothing
     notebook: str = ""  # that shows it
     results: Sequence[str] = ()  # names of its results files
-    name_results: Callable[..., Sequence[str]] | None = None  # files to show, by the options; default: the first result
+    shows: Callable[..., Sequence[Path]] | None = None  # files of the preset that it shows; default: the first result
     derive: Callable[[Path, dict[str, Any]], Results] | None = None  # more, from a preset's folder and its results
     tables: Mapping[str, Shown] = field(default_factory=dict)
     figures: Mapping[str, Callable[[Path], Figure | None]] = field(default_factory=dict)  # from a preset's results
     claims: Sequence[Callable[[Results], Claim]] = ()
     findings: Sequence[Finding] = ()
     compared: Mapping[str, Measure] = field(default_factory=dict)  # by the verdict, of its first results file
+
+    def list_shown(self, paths: Paths, **options: Any) -> Sequence[Path]:
+        """The files that the study with these options shows."""
+        return self.shows(paths, **options) if self.shows else [paths.results / f"{n}.json" for n in self.results[:1]]
 
     def load(self, folder: Path) -> dict[str, Any]:
         """{name: content} of its results files that are there, and what it derives from them."""
@@ -113,6 +119,7 @@ class Experiment:
     paths: Paths
     runs: bool
     options: Mapping[str, Any]
+    shown: Sequence[Path]  # files
 
     @cached_property
     def preset(self) -> Preset:
@@ -124,10 +131,10 @@ class Experiment:
         return self.study.run(self.paths, **self.options) if self.runs else None
 
     def read(self, name: str = "", *, depth: int = 1) -> dict[str, Any]:
-        """The content of a results file of the preset, by default of the first that the study shows; {} of none."""
+        """The content of a results file beside those that the study shows, by default of the first; {} of none."""
         from mmgsd.measure.evaluation import read_results  # with torch
 
-        return read_results(self.paths.results / f"{name or list_shown(self.study, self.options)[0]}.json", depth=depth)
+        return read_results(self.shown[0].with_name(f"{name}.json") if name else self.shown[0], depth=depth)
 
     def draw(self, name: str) -> Figure | None:
         """A figure of the study, from the preset's results; None where these are not there."""
@@ -137,7 +144,14 @@ class Experiment:
         """A table or a sentence of the study from the preset's results, as a notebook displays it."""
         from IPython.display import Markdown
 
-        return Markdown(to_markdown(self.study.tables[name].make(self.read(Path(self.study.tables[name].file).stem))))
+        shown = self.study.tables[name]
+        return Markdown(to_markdown(shown.make(self.read(Path(shown.file).stem))))
+
+    def show_file(self, path: Path) -> Any:
+        """A stored figure, as a notebook displays it."""
+        from mmgsd.figures.stored import show_stored
+
+        return show_stored(path)
 
 
 def list_studies() -> list[Study]:
@@ -160,16 +174,21 @@ def open_study(name: str, preset: str, *, run: bool = False, **options: Any) -> 
     ValueError, which says what to run first, where what it needs for that is not there.
     """
     study, paths = get_study(name), Paths(find_root(), preset)
+    shown = study.list_shown(paths, **options)
     if run:
         study.check(paths, **options)
     else:
-        check_stored(paths, study.notebook, *(f"{file}.json" for file in list_shown(study, options)))
-    return Experiment(study, paths, run, options)
+        by = f"{study.notebook} with run=True" if study.notebook else f"python -m mmgsd.studies run {name}"
+        check_made(paths, by, shown)
+    return Experiment(study, paths, run, options, shown)
 
 
-def list_shown(study: Study, options: Mapping[str, Any]) -> Sequence[str]:
-    """The results files that a study with these options shows."""
-    return study.name_results(**options) if study.name_results else study.results[:1]
+def save_figures(figures: Mapping[str, Figure | None], folder: Path) -> pd.DataFrame:
+    """Write those of some figures that there are into a folder, as PDF and PNG; the files' names."""
+    from mmgsd.figures.style import save_figure
+
+    saved = [path for name, figure in figures.items() if figure for path in save_figure(figure, folder / name)]
+    return pd.Series([path.name for path in saved], name="file").to_frame()
 
 
 def run_study(name: str, preset: str, *, root: Path | None = None, **options: Any) -> Path:

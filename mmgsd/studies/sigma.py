@@ -43,12 +43,12 @@ def run(paths: Paths, *, sigmas_px: Sequence[float] = (), steps: int = 0, overwr
     for model in ProgressBar(list_models(paths.preset, sigmas_px, steps=steps), desc="models"):
         train_and_ask(model, paths, overwrite=overwrite)
     write_sigma_table(load_preset(paths.preset), paths.root, sigmas_px, steps=steps)
-    return paths.results / f"{name_results(steps=steps)[0]}.json"
+    return list_shown(paths, steps=steps)[0]
 
 
-def name_results(*, steps: int = 0, **_: Any) -> list[str]:
+def list_shown(paths: Paths, *, steps: int = 0, **_: Any) -> list[Path]:
     """The results file of so many steps."""
-    return [f"sigma_{steps}" if steps else "sigma"]
+    return [paths.results / (f"sigma_{steps}.json" if steps else "sigma.json")]
 
 
 def tabulate(results: Results, measure: str = "rmse_mean") -> pd.DataFrame:
@@ -115,7 +115,7 @@ def plot_sigma_ablation(
 
 
 STUDY = Study(
-    "sigma", 20, run, check, "05_sigma_ablation", ("sigma",), name_results,
+    "sigma", 20, run, check, "05_sigma_ablation", ("sigma",), list_shown,
     tables={
         "sigma": Shown("paper/sigma.json", describe_sigma, "sigma_table"),
         "sigma_4000": Shown("paper/sigma_4000.json", describe_sigma),

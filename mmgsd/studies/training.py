@@ -114,6 +114,7 @@ def plot_training(logs: Mapping[str, pd.DataFrame], *, columns: int = 4) -> Figu
 
 
 STUDY = Study(
-    "training", 0, run, check, "04_evaluate", ("runs",), lambda **_: ("runs", "rmse"),
+    "training", 0, run, check, "04_evaluate", ("runs",),
+    lambda paths, **_: [paths.results / "runs.json", paths.results / "rmse.json"],
     tables={"runs": Shown("paper/runs.json", describe_runs, "runs_table")},
 )  # fmt: skip

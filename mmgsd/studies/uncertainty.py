@@ -273,7 +273,8 @@ def _draw_coverage(axis: Axes, queries: pd.DataFrame, style: dict) -> None:
 
 
 STUDY = Study(
-    "uncertainty", 80, run, check, "06_uncertainty", ("uncertainty",), lambda **_: ("uncertainty", "rmse"),
+    "uncertainty", 80, run, check, "06_uncertainty", ("uncertainty",),
+    lambda paths, **_: [paths.results / "uncertainty.json", paths.results / "rmse.json"],
     tables={"uncertainty": Shown("paper/uncertainty.json", describe_uncertainty, "uncertainty_table")},
     claims=(judge_entropy, judge_inward),
     findings=(
