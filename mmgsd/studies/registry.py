@@ -145,7 +145,9 @@ class Experiment:
         from IPython.display import Markdown
 
         shown = self.study.tables[name]
-        return Markdown(to_markdown(shown.make(self.read(Path(shown.file).stem))))
+        file = Path(shown.file)
+        results = self.read(file.stem) if file.suffix else load_results(self.paths.results)
+        return Markdown(to_markdown(shown.make(results)))
 
     def show_file(self, path: Path) -> Any:
         """A stored figure, as a notebook displays it."""

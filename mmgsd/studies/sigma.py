@@ -60,7 +60,8 @@ def tabulate(results: Results, measure: str = "rmse_mean") -> pd.DataFrame:
 def tabulate_longer(folder: Path) -> pd.DataFrame:
     """The mean errors with other steps than the studies', of a preset's folder of results: a row a file and object."""
     found = {path.stem: read_results(path, depth=2) for path in sorted(folder.glob("sigma_*.json"))}
-    return pd.concat({name: tabulate(results).T for name, results in found.items()}).rename_axis(columns="σ (px)")
+    tables = {name: tabulate(results).T for name, results in found.items()}
+    return pd.concat(tables).rename_axis(columns="σ (px)") if tables else pd.DataFrame()
 
 
 def describe_sigma(results: Results) -> Table:
