@@ -1,8 +1,8 @@
 """The studies from a shell.
 
-    python -m mmgsd.studies list                                what there is
-    python -m mmgsd.studies run sigma --preset quick            train, ask, write the results, print their path
-    python -m mmgsd.studies run sigma --preset paper steps=4000 options of the study, as its `run` names them
+    python -m mmgsd.studies list                                        what there is
+    python -m mmgsd.studies run sigma --preset quick                    train, ask, write the results, print their path
+    python -m mmgsd.studies run sigma --preset paper --set steps=4000   an option of the study, as its `run` names it
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ def main() -> None:
     run = commands.add_parser("run", help="make the results of one, and go on where it was killed")
     run.add_argument("study")
     run.add_argument("--preset", default="quick")
-    run.add_argument("options", nargs="*", type=_read_option, metavar="NAME=VALUE", help="as the study's run has them")
+    run.add_argument("--set", dest="options", action="append", default=[], type=_read_option, metavar="NAME=VALUE",
+                     help="an option of the study's run; may be given several times")  # fmt: skip
     args = parser.parse_args()
     if args.command == "list":
         print("\n".join(f"{study.name:<16} {study.notebook}" for study in list_studies()))

@@ -64,7 +64,7 @@ def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 def test_a_new_study_is_run_from_a_shell_and_shown(
     root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
-    monkeypatch.setattr(sys, "argv", ["mmgsd.studies", "run", "toy", "--preset", "quick", "factor=2"])
+    monkeypatch.setattr(sys, "argv", ["mmgsd.studies", "run", "toy", "--preset", "quick", "--set", "factor=2"])
     command.main()
     file = Paths(root, "quick").results / "toy.json"
     assert Path(capsys.readouterr().out.strip()) == file and json.loads(file.read_text())["cloth"]["toy"]["speed"] == 4
