@@ -17,8 +17,8 @@ import pytest
 import tomllib
 
 from mmgsd.dataset import load_dataset
-from mmgsd.report.findings import FINDINGS, SECTIONS
 from mmgsd.report.tables import update_tables
+from mmgsd.studies.registry import list_studies
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "data/results/README.md",
@@ -183,8 +183,9 @@ def test_make_readme_has_nothing_to_change(path: Path, tmp_path: Path) -> None:
 
 def test_every_finding_is_short_and_leads_to_a_section() -> None:
     anchors = list_anchors(ROOT / "data" / "results" / "README.md")
-    assert set(SECTIONS.values()) <= anchors
-    assert all(len(f"{name} {sentence}".split()) <= 25 for name, sentence, _ in FINDINGS)
+    findings = [finding for study in list_studies() for finding in study.findings]
+    assert {finding.section for finding in findings} <= set(anchors)
+    assert all(len(f"{finding.name} {finding.sentence}".split()) <= 25 for finding in findings)
 
 
 def test_the_results_page_says_how_to_read_each_table_in_few_words() -> None:

@@ -18,12 +18,28 @@ from mmgsd.command import run_command
 from mmgsd.config import IMAGE_SIZE, load_preset
 from mmgsd.files import write_text
 from mmgsd.paths import Paths, find_root
-from mmgsd.report import latex_tables as tables
-from mmgsd.report.claims import list_claims
-from mmgsd.report.findings import describe_claims
-from mmgsd.report.results import load_results, told_where
+from mmgsd.report.claims import describe_claims, list_claims
+from mmgsd.studies.registry import Shown, list_studies, load_results, told_where
+from mmgsd.studies.table import Table, lay_out
+
+NOT_RUN = r"\emph{Not run for this preset.}"
+RULE = r"\midrule"
+SPECIAL = {c: rf"\{c}" for c in "&%$#_{}"} | {
+    "\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "±": r"$\pm$", "°": r"$^\circ$",
+    "→": r"$\to$", "σ": r"$\sigma$", "×": r"$\times$", "≤": r"$\le$", "–": "--",
+}  # fmt: skip
+MARKUP = {  # of escaped text
+    r"`(.+?)`": r"\\texttt{\1}", r"\*\*(.+?)\*\*": r"\\textbf{\1}", r"\*(.+?)\*": r"\\emph{\1}",
+    r"(?<=\d) \\%": r"\\,\\%", r"(?<=\d) (px|nats)\b": r"~\1", r" (\$\\to\$) ": r"\\,\1\\,", r"(?<!\w)-(?=\d)": "$-$",
+}  # fmt: skip
+CLAIMS = r"@{}>{\hsize=0.85\hsize}L>{\hsize=1.15\hsize}L>{\raggedright\arraybackslash}p{6.3em}L@{}"  # columns
 
 Results = Mapping[str, Any]
+
+
+def list_tables() -> dict[str, Shown]:
+    """{what is input: table} of all studies that the report shows."""
+    return {shown.report: shown for study in list_studies() for shown in study.tables.values() if shown.report}
 
 
 def write_report(preset: str, root: Path) -> list[Path]:
@@ -37,11 +53,13 @@ def write_report(preset: str, root: Path) -> list[Path]:
         claims = list_claims(results)
         described = dataclasses.asdict(config) | {"image_size": IMAGE_SIZE}
         numbers = {**results, "config": described, "verdict": {claim.key: claim.verdict for claim in claims}}
-        table = tables.to_latex(describe_claims(results), tables.CLAIMS)
+        table = to_latex(describe_claims(results), CLAIMS)
         texts = {"results": make_definitions(preset, numbers), "claims_table": table}
-    for name, (file, make) in tables.TABLES.items():
-        with told_where(paths.results / f"{file}.json"):
-            texts[name] = tables.to_latex(make(results[file])) if file in results else tables.NOT_RUN
+    for name, shown in list_tables().items():
+        file = Path(shown.file).name
+        with told_where(paths.results / file):
+            content = results.get(Path(file).stem)
+            texts[name] = NOT_RUN if content is None else to_latex(shown.make(content))
     return [write_text(root / "paper" / "generated" / f"{name}.tex", f"{text}\n") for name, text in texts.items()]
 
 
@@ -66,13 +84,57 @@ def _walk(tree: Any, prefix: str) -> Iterator[tuple[str, str]]:
             name = re.sub(r"[^A-Za-z0-9@._]+", "-", str(key)).strip("-")
             yield from _walk(value, f"{prefix}/{name}" if prefix else name)
     elif tree is not None:
-        yield prefix, tables.escape(tree) if isinstance(tree, str) else str(tree).lower()
+        yield prefix, escape(tree) if isinstance(tree, str) else str(tree).lower()
 
 
 def make_definitions(preset: str, numbers: Results) -> str:
     r"""``\preset``, and a ``\defresult{key}{value}`` for every number."""
     lines = [rf"\defresult{{{key}}}{{{value}}}" for key, value in flatten(numbers).items()]
-    return "\n".join([rf"\newcommand{{\preset}}{{{tables.escape(preset)}}}", *lines])
+    return "\n".join([rf"\newcommand{{\preset}}{{{escape(preset)}}}", *lines])
+
+
+def escape(text: str) -> str:
+    """Text in which LaTeX's special characters, and those of ours that it lacks, stand for themselves."""
+    return "".join(SPECIAL.get(character, character) for character in text)
+
+
+def set_text(text: str) -> str:
+    """Text with Markdown's bold, quoted and code, units that stay with their number, and signs of minus."""
+    text = escape(text)
+    for pattern, latex in MARKUP.items():
+        text = re.sub(pattern, latex, text)
+    return text
+
+
+def to_latex(table: Table, columns: str = "") -> str:
+    """A described table as LaTeX: its blocks have titles above rules, its sections a line of their own.
+
+    ``columns`` are tabularx's, of a table of sentences that is as wide as the page.
+    """
+    layout = lay_out(table, page=False)
+    heads = [head for _, block in layout.blocks for head in block]
+    lines = [r"\toprule", *_set_titles(layout.blocks), _join([table.first, *heads])]
+    for title, rows in layout.sections:
+        lines += [RULE, *([_join([title.capitalize()])] if title else [])]
+        lines.append(("\\addlinespace\n" if columns else "\n").join(map(_join, rows)))
+    name = "tabularx" if columns else "tabular"
+    shape = rf"{{\textwidth}}{{{columns}}}" if columns else rf"{{@{{}}l*{{{len(heads)}}}{{r}}@{{}}}}"
+    return "\n".join([rf"\begin{{{name}}}{shape}", *lines, r"\bottomrule", rf"\end{{{name}}}"])
+
+
+def _set_titles(blocks: Sequence[tuple[str, Sequence[str]]]) -> list[str]:
+    """The line of the blocks' titles, and a rule below each; none where no block has one."""
+    cells, rules, first = "", [], 2
+    for number, (title, heads) in enumerate(blocks, start=1):
+        last = first + len(heads) - 1
+        cells += rf" & \multicolumn{{{len(heads)}}}{{c}}{{{set_text(title)}}}" if title else " &" * len(heads)
+        rules += [rf"\cmidrule({'l' if number == len(blocks) else 'lr'}){{{first}-{last}}}"] if title else []
+        first = last + 1
+    return [cells + r" \\" + "".join(rules)] if rules else []
+
+
+def _join(cells: Sequence[str]) -> str:
+    return " & ".join(map(set_text, cells)) + r" \\"
 
 
 def main() -> None:

@@ -15,7 +15,7 @@ from typing import Any
 
 from mmgsd.files import DamagedFileError, locked, set_aside, write_json
 from mmgsd.paths import Paths
-from mmgsd.report.results import REMEDY, read_table
+from mmgsd.studies.registry import REMEDY, read_table
 
 
 def find_run(paths: Paths) -> Path:

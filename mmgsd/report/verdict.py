@@ -7,7 +7,7 @@ however often it is killed: ``data/generated/PRESET/notebooks/stored.json``.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,41 +17,16 @@ import pandas as pd
 
 from mmgsd.files import DamagedFileError, set_aside, write_json, write_text
 from mmgsd.paths import Paths
-from mmgsd.report.claims import get
-from mmgsd.report.results import read_table, told_where
 from mmgsd.report.stages import find_run
+from mmgsd.studies.claims import get
 from mmgsd.studies.models import UNTRAINED
+from mmgsd.studies.registry import Measure, list_studies, read_table, told_where
 
 DEVIATIONS = 3  # of the seeds: as far as another training of the same model may be
-COMPARED = ("rmse", "sigma", "uncertainty")  # results files that the stages write, with a row a model or method
 MINUTES = ("runs.json", "stages.json")  # hold minutes, which are others each time
 EQUAL, AGREES, DIFFERS, MISSING, NEW, NOT_RUN = "equal", "agrees", "differs", "missing", "new", "not run here"
 SHOWN = 5  # differing numbers that the summary names
 NO_MEANING = "Nothing is learnt in smoke, so its numbers mean nothing: they show only that every stage runs.\n"
-
-
-@dataclass(frozen=True)
-class Measure:
-    """The least tolerance of a number that is compared: the larger of ``floor`` and ``share``.
-
-    Another number of threads alone moves an RMSE by 2 % and a share of matches by 0.01: of quick, compare rmse.json,
-    trained by two, with the seed 0 of seeds.json, trained by one.
-    """
-
-    floor: float = 0.0  # in its own unit
-    share: float = 0.0  # of the stored value
-    like: str = ""  # the measure whose spread over seeds is its own
-
-
-MEASURES = {
-    "rmse_mean": Measure(share=0.03, like="rmse_mean"),
-    "median": Measure(share=0.03, like="median"),
-    "pck@20px": Measure(floor=0.015, like="pck@20px"),
-    "aurc": Measure(share=0.03, like="rmse_mean"),  # px: a mean of RMSE
-    "spearman": Measure(floor=0.05),  # no seeds are stored of this and the next two
-    "coverage@90%": Measure(floor=0.05),
-    "ece": Measure(floor=0.05),
-}
 
 
 @dataclass(frozen=True)
@@ -113,6 +88,11 @@ def digest_files(paths: Paths) -> dict[str, str]:
     return {path.relative_to(paths.root).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
+def list_measures() -> dict[str, Measure]:
+    """{name: tolerance} of all that studies have compared; a name has one tolerance."""
+    return {name: measure for study in list_studies() for name, measure in study.compared.items()}
+
+
 def compare_numbers(stored: Mapping[str, Any], found: Mapping[str, Any], paths: Paths) -> pd.DataFrame:
     """A row for each number of either {name of the results file: content}, and whether it agrees.
 
@@ -120,12 +100,11 @@ def compare_numbers(stored: Mapping[str, Any], found: Mapping[str, Any], paths: 
     where its own are not there, and no less than the floor of its `Measure`, which is that of untrained ones.
     """
     old, new = (dict(_list_numbers(results)) for results in (stored, found))
-    spreads = measure_spreads(stored.get("seeds", {}))
-    rows = {}
+    spreads, measures, rows = measure_spreads(stored.get("seeds", {})), list_measures(), {}
     for key in dict.fromkeys([*new, *old]):
         _, name, row, measure = key
         before, now = old.get(key), new.get(key)
-        tolerance = np.nan if before is None else compute_tolerance(measure, name, row, before, spreads)
+        tolerance = np.nan if before is None else compute_tolerance(measures[measure], name, row, before, spreads)
         said = judge_number(before, now, tolerance) if _is_made(found, key, paths) or now is None else NOT_RUN
         rows[key] = {"stored": before, "this run": now, "tolerance": tolerance, "agrees": said}
     index = pd.MultiIndex.from_tuples(rows, names=["table", "object", "row", "measure"]) if rows else None
@@ -148,17 +127,16 @@ def measure_spreads(seeds: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> dic
     for name, rows in seeds.items():
         for method in dict.fromkeys(key.rpartition("-")[0] for key in rows):
             each = [row for key, row in rows.items() if key.rpartition("-")[0] == method]
-            for measure in {measure.like for measure in MEASURES.values()} & set(each[0]):
+            for measure in {measure.like for measure in list_measures().values()} & set(each[0]):
                 if len(each) > 1:
                     spreads[name, method, measure] = float(np.std([row[measure] for row in each], ddof=1))
     return spreads
 
 
 def compute_tolerance(
-    measure: str, name: str, row: str, stored: float, spreads: Mapping[tuple[str, str, str], float]
+    rule: Measure, name: str, row: str, stored: float, spreads: Mapping[tuple[str, str, str], float]
 ) -> float:
     """How far a number of the object ``name`` may be from the stored one, in its own unit."""
-    rule = MEASURES[measure]
     floor = max(rule.floor, rule.share * abs(stored))
     if row in {model.name for model in UNTRAINED}:
         return floor
@@ -223,16 +201,19 @@ def _find_stored(paths: Paths) -> Path:
 
 
 def _list_numbers(results: Mapping[str, Any]) -> Iterator[tuple[tuple[str, ...], float]]:
-    """((table, object, row, measure), value) of the measures that are compared."""
-    for file in COMPARED:
-        yield from _walk(results.get(file, {}), (file,))
+    """((table, object, row, measure), value) of the measures that studies have compared."""
+    for study in list_studies():
+        if study.compared:
+            yield from _walk(results.get(study.results[0], {}), (study.results[0],), study.compared)
 
 
-def _walk(values: Mapping[str, Any], keys: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], float]]:
+def _walk(
+    values: Mapping[str, Any], keys: tuple[str, ...], measures: Collection[str]
+) -> Iterator[tuple[tuple[str, ...], float]]:
     for name, value in values.items():
         if isinstance(value, Mapping):
-            yield from _walk(value, (*keys, name))
-        elif name in MEASURES and value is not None:
+            yield from _walk(value, (*keys, name), measures)
+        elif name in measures and value is not None:
             yield (", ".join(keys[:-2]), *keys[-2:], name), float(value)
 
 

@@ -6,6 +6,7 @@ python -m mmgsd.studies.continuity    the shipped weights about the sample -> da
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,8 @@ from mmgsd.measure.questions import draw_pairs
 from mmgsd.measure.regions import SIDE
 from mmgsd.paths import Paths, find_root
 from mmgsd.progress import ProgressBar
+from mmgsd.studies.claims import Claim, get, is_better, list_shares
+from mmgsd.studies.registry import Results, Study
 from mmgsd.studies.sample import PAPER_SIZE, load_sample, load_shipped
 
 JUMP_PX = 20.0  # by which two neighbours' errors differ where a match jumps
@@ -55,13 +58,33 @@ def _list_neighbours(offsets: np.ndarray, data: Dataset) -> list[tuple[np.ndarra
     return [(grid[1:], grid[:-1]), (grid[:, 1:], grid[:, :-1])]
 
 
+def run(paths: Paths) -> Path:
+    """Measure the shipped weights that learnt from the paper's images alone; continuity.json."""
+    rows = {name: {method: measure_jumps(load_shipped(name, method), load_sample(paths.root, name))
+                   for method in PAPER_SIZE} for name in OBJECTS}  # fmt: skip
+    return write_json(paths.results / "continuity.json", rows)
+
+
+def judge_continuous(results: Results) -> Claim:
+    """Whether neighbouring pixels have neighbouring matches."""
+    jumps = {m: {name: get(results, "continuity", name, m, "jumps") for name in OBJECTS} for m in PAPER_SIZE}
+    parts = tuple(is_better(jumps["mmgsd"][name], jumps["spcl"][name]) for name in OBJECTS)
+    shown = [f"{m.upper()}: {list_shares(row, 'permille')}" for m, row in jumps.items()]
+    return Claim(
+        "continuous", "SPCL's answers are discontinuous; MMGSD's are more continuous.",
+        "Fewer of MMGSD's matches jump from one material point to its neighbour; a part each object.",
+        f"jumps, {'; '.join(shown)}; the sample's images, one seed", parts,
+        "`.venv/bin/python -m mmgsd.studies.continuity`", PAPER_SIZE,
+    )  # fmt: skip
+
+
+STUDY = Study("continuity", 40, run, results=("continuity",), claims=(judge_continuous,))
+
+
 def main() -> None:
-    """Measure the shipped weights that learnt from the paper's images alone."""
+    """Measure, for the preset that these weights are of."""
     argparse.ArgumentParser(prog="python -m mmgsd.studies.continuity", description=__doc__).parse_args()
-    root = find_root()
-    rows = {name: {method: measure_jumps(load_shipped(name, method), load_sample(root, name)) for method in PAPER_SIZE}
-            for name in OBJECTS}  # fmt: skip
-    print(write_json(Paths(root, "paper").results / "continuity.json", rows))
+    print(run(Paths(find_root(), "paper")))
 
 
 if __name__ == "__main__":

@@ -1,8 +1,9 @@
-"""Where a model's error sits: against occlusion, the objects' states, the distance to the border and to a fold."""
+"""Where the error is: against occlusion, the objects' states, the distance to the border and to a fold."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from scipy.ndimage import distance_transform_cdt
 
-from mmgsd.dataset import Dataset
+from mmgsd.config import OBJECTS, TrainConfig, load_preset
+from mmgsd.dataset import Dataset, load_dataset
 from mmgsd.figures.style import (
     MARK,
     MODE,
@@ -26,11 +28,21 @@ from mmgsd.figures.style import (
     make_grid,
     mark_pixel,
     mark_true,
+    save_figure,
     styled,
 )
 from mmgsd.match.match import Match
-from mmgsd.studies.models import get_colour
+from mmgsd.match.matcher import Matcher
+from mmgsd.measure.evaluation import load_queries, read_results, write_results
+from mmgsd.model.tensors import WEIGHTS
+from mmgsd.paths import Paths
+from mmgsd.studies.claims import NATS, Claim, get, is_above, say
+from mmgsd.studies.models import configure_model, get_colour
+from mmgsd.studies.parameters import check_images, check_made
+from mmgsd.studies.registry import Finding, Results, Shown, Study
+from mmgsd.studies.table import Table, describe_objects
 
+SEEN, KNOTS = ("seen", "hidden"), ("straight", "overhand knot")  # kinds of queries; states of the rope
 FEW_PAIRS = 5  # of images: their mean says as much of them as of their states
 QUESTIONS = {
     "hidden": ("hidden\nmatches", [0, 1, 2, 3, 4, 5]),
@@ -39,6 +51,67 @@ QUESTIONS = {
     "covered": ("points to\na hidden one", [1, 2, 4, 8, 16, 1000]),
 }
 LENGTHS = {"border": [0, 16, 48, 96, 160, 313], "covered": [1, 4, 16, 48, 96, 1000]}  # the same along a rope
+
+
+def list_models(preset: str, method: str, objects: Sequence[str]) -> dict[str, TrainConfig]:
+    """{object: training} of a method of the main table."""
+    return {name: configure_model(load_preset(preset), name, method) for name in objects}
+
+
+def check(paths: Paths, *, method: str = "mmgsd", objects: Sequence[str] = OBJECTS, worst: int = 24) -> None:
+    """ValueError where images, models or their answers are missing."""
+    check_images(paths, objects)
+    models = list_models(paths.preset, method, objects).values()
+    files = [file for m in models for file in (paths.model(m) / WEIGHTS, paths.queries(m.name))]
+    check_made(paths, "03_train and 04_evaluate, or python -m mmgsd.studies.matrix,", files, method=method)
+
+
+def run(paths: Paths, *, method: str = "mmgsd", objects: Sequence[str] = OBJECTS, worst: int = 24) -> Path:
+    """Join the answers of a method with what the labels know; errors.json, entropy.json, figures of the ``worst``.
+
+    Of another method than MMGSD these files have its name. An object that is left out stays in them.
+    """
+    suffix = _get_suffix(method)
+    tables, explained, nats = {}, {}, {}
+    for name, model in list_models(paths.preset, method, objects).items():
+        data = load_dataset(paths.dataset(name), "test")
+        tables[name] = describe_queries(load_queries(paths.queries(model.name)), data)
+        explained[name], nats[name] = explain_errors(tables[name]), summarise_entropy(tables[name])
+        sheet = plot_worst_queries(tables[name], data, Matcher.load(paths.model(model) / WEIGHTS), count=worst)
+        save_figure(sheet, paths.figures / f"worst_{name}{suffix}", kinds=("jpg",))
+    save_figure(plot_error_analysis(tables), paths.figures / f"error_analysis{suffix}")
+    file, other = (paths.results / f"{name}{suffix}.json" for name in ("errors", "entropy"))
+    write_results(read_results(other) | nats, other)
+    return write_results(read_results(file) | explained, file)
+
+
+def _get_suffix(method: str) -> str:
+    """What the names of a method's files end with."""
+    return "" if method == "mmgsd" else f"_{method}"
+
+
+def list_shown(paths: Paths, *, method: str = "mmgsd", **_: Any) -> list[Path]:
+    """The results file of a method's errors."""
+    return [paths.results / f"errors{_get_suffix(method)}.json"]
+
+
+def list_figures(paths: Paths, *, method: str = "mmgsd", objects: Sequence[str] = OBJECTS) -> list[Path]:
+    """Those of a method's figures that are there: of some methods the repository holds the numbers alone."""
+    suffix = _get_suffix(method)
+    names = [f"error_analysis{suffix}.png", *(f"worst_{name}{suffix}.jpg" for name in objects)]
+    return [path for path in map(paths.figures.joinpath, names) if path.is_file()]
+
+
+def explain_errors(described: pd.DataFrame) -> dict[str, float]:
+    """Mean RMSE (px) of `describe_queries`: of all, and if some difficulty went away."""
+    states = summarise_states(described)
+    means = {"all": described.rmse_px.mean(), "no match hidden": described[described.hidden == 0].rmse_px.mean(),
+             "easiest pair of states": states.min().min()}  # fmt: skip
+    hardest = described.groupby("state1", observed=True).rmse_px.mean().idxmax()
+    spared = described[(described.state0 != hardest) & (described.state1 != hardest)]
+    if len(spared):  # smoke may hold but that state
+        means["hardest state left out"] = spared.rmse_px.mean()
+    return {question: round(float(mean), 2) for question, mean in means.items()}
 
 
 def describe_queries(queries: pd.DataFrame, data: Dataset) -> pd.DataFrame:
@@ -75,6 +148,34 @@ def summarise_entropy(described: pd.DataFrame) -> dict[str, float]:
     kinds = described.hidden.gt(0).map({False: "seen", True: "hidden"})
     means = [described.groupby(key, observed=True).entropy.mean() for key in (kinds, "state1")]
     return {str(kind): round(float(mean), 3) for kind, mean in pd.concat(means).items()}
+
+
+def describe_difficulties(results: Results) -> Table:
+    """What would be left of MMGSD's RMSE if some difficulty went away, from {object: {which queries: error}}."""
+    kinds = dict.fromkeys(kind for row in results.values() for kind in row)
+    rows = {kind: {name: get(results, name, kind) for name in OBJECTS} for kind in kinds}
+    return describe_objects("MMGSD's RMSE px", rows)
+
+
+def judge_hidden(results: Results) -> Claim:
+    """Uncertainty where something covers the match; of the heatmap's entropy, not of its mass outside the modes."""
+    nats = {name: get(results, "entropy", name) or {} for name in OBJECTS}
+    pairs = {f"{name}, {high}": (nats[name].get(high), nats[name].get(low), low)
+             for name, low, high in (*((name, *SEEN) for name in OBJECTS), ("rope", *KNOTS))}  # fmt: skip
+    shown = [f"{kind} {say(high, 'share')}, {other} {say(low, 'share')}"
+             for kind, (high, low, other) in pairs.items()]  # fmt: skip
+    return Claim(
+        "hidden", "Uncertainty is high at rope knots and at what is occluded.",
+        f"MMGSD's entropy is at least {NATS} nats higher where a match is hidden, a part each object, and on knotted "
+        "ropes than on straight ones, a part.", f"nats, {'; '.join(shown)}; one seed",
+        tuple(is_above(high, low) for high, low, _ in pairs.values()), models=("mmgsd",),
+    )  # fmt: skip
+
+
+def count_findings(results: Results) -> dict[str, str]:
+    """What is left of the cloth's error where no match is hidden."""
+    hidden = results["errors"]["cloth"]
+    return {"seen": f"{100 * hidden['no match hidden'] / hidden['all']:.0f} %"}
 
 
 @styled
@@ -170,3 +271,14 @@ def plot_worst(matches: Sequence[Match], true: Sequence[np.ndarray], errors_px: 
                for label, (m, face, edge) in signs.items()]  # fmt: skip
     figure.legend(handles=handles, loc="outside lower center", ncols=len(signs), fontsize=6)
     return figure
+
+
+STUDY = Study(
+    "errors", 90, run, check, "09_error_analysis", ("errors", "entropy"), list_shown,
+    tables={"errors": Shown("paper/errors.json", describe_difficulties, "errors_table")},
+    claims=(judge_hidden,),
+    findings=(
+        Finding(6, "Hidden matches", " are a part of the cloth's error: {seen} of it remain without them.",
+                "where-is-the-error", count_findings),
+    ),
+)  # fmt: skip

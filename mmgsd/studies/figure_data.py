@@ -16,12 +16,12 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from mmgsd.dataset import Dataset
+from mmgsd.figures.style import check_filled
 from mmgsd.files import DamagedFileError, write_bytes
 from mmgsd.match.match import Match
 from mmgsd.match.matcher import Matcher
 from mmgsd.measure.metrics import ErrorSummary, summarise_errors
 from mmgsd.measure.shipped import PLAIN
-from mmgsd.studies.main import compute_object_size
 
 QUALITY = 90  # of the example's images, JPEG
 TRUE = "true{}"  # the tensors of the queries' true matches: true, true1, …
@@ -84,6 +84,13 @@ def choose_contrast(data: FigureData) -> int:
         errors = [np.nanmin(np.linalg.norm(true[:, None] - mode, axis=-1), 1).mean() for mode in modes]
         spreads.append(np.ptp(errors))
     return int(np.argmax(spreads))
+
+
+def compute_object_size(masks: Sequence[np.ndarray]) -> float:
+    """Diagonal of the object's bounding box in px, mean over (H, W) bool masks."""
+    check_filled("masks", masks)
+    spans = [np.ptp(np.argwhere(mask), axis=0) + 1 for mask in masks]
+    return float(np.linalg.norm(spans, axis=1).mean())
 
 
 def gather_figure_data(

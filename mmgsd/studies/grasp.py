@@ -26,11 +26,16 @@ from mmgsd.fold.tasks import GRASP, GROUNDS
 from mmgsd.match.match import Match
 from mmgsd.match.matcher import Matcher, load
 from mmgsd.paths import Paths, find_root
-from mmgsd.studies.folding import ROLLOUTS, Bench, Rollout, find_on_table
+from mmgsd.studies.claims import Claim, get, say
+from mmgsd.studies.folding import ROLLOUTS, Bench, Rollout, find_on_table, say_beyond, say_share
+from mmgsd.studies.registry import Results, Shown, Study
+from mmgsd.studies.table import Table, make_page_table
 from mmgsd.symmetry import load_group
 
 MATCHERS = {"mmgsd": "cloth", "mmgsd_paper": "cloth-paper", "spcl": "cloth-spcl"}  # shipped weights that answer
-WAYS = ("surest", "probable", "any")  # the narrowest mode, the most probable one, or one at random
+LABELS = {"mmgsd": "MMGSD", "mmgsd_paper": "MMGSD of clean images alone", "spcl": "SPCL"}
+# The narrowest mode, the most probable one, or one at random.
+WAYS = {"surest": "the surest corner", "probable": "the most probable", "any": "any"}
 NEAR = 0.05  # of the side
 CORNERS = load_group(GRASP.object, DEFAULT_GROUP[GRASP.object]).orbit(GRASP.looks[0][0].pick)  # where one was shown
 
@@ -44,11 +49,11 @@ def list_grasps(count: int) -> list[Rollout]:
             for k in range(count)]  # fmt: skip
 
 
-def run_grasps(preset: str, root: Path, *, workers: int = 0, progress: bool = True) -> Path:
+def run(paths: Paths, *, workers: int = 0, progress: bool = True) -> Path:
     """{matcher: {way: `summarise_grasps`}} of a preset's number of rollouts, as ``grasp.json``; its path."""
-    paths, how = Paths(root, preset), {"workers": workers, "progress": progress}
+    how = {"workers": workers, "progress": progress}
     bench = Bench(paths.generated / "folding", how)
-    files = bench.make_starts(list_grasps(ROLLOUTS[preset]))
+    files = bench.make_starts(list_grasps(ROLLOUTS[paths.preset]))
     states = {rollout: read_state(file) for rollout, file in files.items()}
     states = {rollout: state for rollout, state in states.items() if not state.about["fault"]}
     look, results = bench.make_demonstration(GRASP).looks[0], {}
@@ -100,13 +105,45 @@ def summarise_grasps(rows: Mapping[str, Outcome], others: Mapping[str, Outcome])
             "lifted": estimate_share([bool(row["lifted"]) for row in rows.values()])}  # fmt: skip
 
 
+def describe_grasps(results: Results) -> Table | str:
+    """Single grasps, a row a matcher and way: distance to the nearest corner, beside any mode, lifted.
+
+    ``results`` are all of a preset.
+    """
+    if "grasp" not in results:
+        return "*Not measured yet.*"
+    lines = {f"{label}, {WAYS[way]}": [f"{100 * row['distance']['mean']:.1f} %", say_beyond(row["beyond"]),
+                                       say_share(row["lifted"])]
+             for name, label in LABELS.items() for way, row in results["grasp"].get(name, {}).items()}  # fmt: skip
+    return make_page_table(["distance", "beside any", "lifted"], lines)
+
+
+def judge_surest(results: Results) -> Claim:
+    """What the paper is for: a robot takes the one of the like corners that it is surest of (its introduction)."""
+    ways = {"surest": "surest", "most probable": "probable", "any": "any"}
+    rows = {way: get(results, "grasp", "mmgsd", key) for way, key in ways.items()}
+    high = get(results, "grasp", "mmgsd", "surest", "beyond", "high")
+    shown = [f"{way} {say(get(row, 'distance', 'mean'), 'percent')} of the side off, lifted "
+             f"{say(get(row, 'lifted', 'mean'), 'percent')}" for way, row in rows.items() if row]  # fmt: skip
+    return Claim(
+        "surest", "Of the four like corners, a robot should take the one that it is surest of.",
+        "One grasp: the surest of the four modes is nearer to a corner than any of them, as far as the 95 % interval "
+        "of the difference tells.", "; ".join(shown) or "–", (None if high is None else high < 0,),
+        "`.venv/bin/python -m mmgsd.studies.grasp paper`",
+    )  # fmt: skip
+
+
+STUDY = Study("grasp", 100, run, results=("grasp",), tables={"grasp": Shown("paper", describe_grasps)},
+              claims=(judge_surest,))  # fmt: skip
+
+
 def main() -> None:
     """Grasp with every matcher."""
     parser = argparse.ArgumentParser(prog="python -m mmgsd.studies.grasp", description=__doc__.split("\n")[0])
     parser.add_argument("preset", choices=tuple(ROLLOUTS))
     parser.add_argument("--workers", type=int, default=0, help="child processes at once (default: one a core)")
     args = parser.parse_args()
-    print(run_grasps(args.preset, find_root(), workers=args.workers))
+    print(run(Paths(find_root(), args.preset), workers=args.workers))
 
 
 if __name__ == "__main__":

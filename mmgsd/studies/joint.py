@@ -1,28 +1,42 @@
-"""The table of joint answers (`mmgsd.measure.joint`)."""
+"""Whether the answers to several pixels belong together (`mmgsd.measure.joint`)."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
+from mmgsd.config import OBJECTS
+from mmgsd.measure.evaluation import read_results, write_results
+from mmgsd.measure.joint import RESULTS, measure_joint
+from mmgsd.paths import Paths
+from mmgsd.studies.registry import Shown, Study
 from mmgsd.studies.shipped import SETS
+from mmgsd.studies.table import Table, make_page_table, say_value
 
 HEADS = {"heaviest": "right: heaviest modes", "joint": "first joint answer", "any_joint": "mean of joint answers",
          "possible": "best choice of modes", "swaps_heaviest": "swaps: heaviest modes",
          "swaps_joint": "first joint answer"}  # fmt: skip
 
 
-def make_joint_table(rows: Mapping[str, Mapping[str, Any]]) -> str:
-    """Markdown: shares of right questions and of swaps, a row an object and set, clean ones by image1's state."""
-    lines = ["|  | " + " | ".join(HEADS.values()) + " |", "|---" * (len(HEADS) + 1) + "|"]
+def run(paths: Paths, *, names: Sequence[str] = OBJECTS) -> Path:
+    """Ask shipped weights by some names; joint.json, in which rows of other names stay."""
+    out = paths.root / "data" / "results" / RESULTS
+    for name in names:
+        write_results(read_results(out) | {name: measure_joint(name, paths.root)}, out)
+    return out
+
+
+def describe_joint(rows: Mapping[str, Mapping[str, Any]]) -> Table:
+    """Shares of right questions and of swaps, a row an object and set, clean ones by image1's state."""
+    lines = {}
     for row in rows.values():
         for preset, word in SETS.items():
             for kind, said in row.get(preset, {}).items():
-                if kind != "all" and preset != next(iter(SETS)):
-                    continue  # of clean images alone
-                label = f"{row['object']}, {word}" if kind == "all" else f"{row['object']}, {word}, {kind}"
-                lines.append(f"| {label} | " + " | ".join(_say(said[name]) for name in HEADS) + " |")
-    return "\n".join(lines)
+                if kind == "all" or preset == next(iter(SETS)):  # states of clean images alone
+                    label = f"{row['object']}, {word}" + ("" if kind == "all" else f", {kind}")
+                    lines[label] = [say_value(said, name, 100, ".0f", " %") for name in HEADS]
+    return make_page_table(list(HEADS.values()), lines)
 
 
 def make_joint_sentence(rows: Mapping[str, Mapping[str, Any]]) -> str:
@@ -33,5 +47,7 @@ def make_joint_sentence(rows: Mapping[str, Mapping[str, Any]]) -> str:
     return f"{asked} questions. A joint answer takes up to {cost} ms more than one that is not ({hardware})."
 
 
-def _say(share: float | None) -> str:
-    return "–" if share is None else f"{100 * share:.0f} %"
+STUDY = Study(
+    "joint", 130, run, shows=lambda paths, **_: [paths.results.parent / RESULTS],
+    tables={"joint": Shown(RESULTS, describe_joint), "joint_counts": Shown(RESULTS, make_joint_sentence)},
+)  # fmt: skip

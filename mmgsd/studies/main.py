@@ -1,8 +1,12 @@
-"""The main table's methods: how large their errors are and where, and what they answer."""
+"""The main study: the methods' errors on the test images, how they are spread, and what the methods answer."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -12,8 +16,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.ndimage import gaussian_filter1d
 
-from mmgsd.config import N_POINTS
-from mmgsd.figures.answers import get_aspect
+from mmgsd.config import METHODS, N_POINTS, OBJECTS, load_preset
+from mmgsd.dataset import load_dataset
+from mmgsd.figures.answers import get_aspect, plot_teaser
 from mmgsd.figures.style import (
     COLUMN_IN,
     MARK,
@@ -30,11 +35,186 @@ from mmgsd.figures.style import (
     styled,
 )
 from mmgsd.match.match import Match
+from mmgsd.measure import evaluation
 from mmgsd.measure.metrics import BIN_PX, ErrorSummary
-from mmgsd.studies.models import CHANCE_STYLES, ROWS, get_colour, get_label, get_line_style
+from mmgsd.measure.questions import choose_points
+from mmgsd.model.tensors import WEIGHTS
+from mmgsd.paths import Paths, find_root
+from mmgsd.studies import figure_data
+from mmgsd.studies.claims import MARGIN, Claim, get, is_at_least, list_errors, list_shares, say
+from mmgsd.studies.figure_data import FigureData, load_figure_data
+from mmgsd.studies.matrix import ALL, write_main_table
+from mmgsd.studies.models import CHANCE_STYLES, PAPER, configure_study, get_label, get_line_style
+from mmgsd.studies.parameters import Reader, among, check_images, check_made, listed
+from mmgsd.studies.registry import ERROR_MEASURES, Finding, Results, Shown, Study
+from mmgsd.studies.sample import load_sample, load_shipped
+from mmgsd.studies.table import LABELS, Table, describe_errors, describe_objects
 
+IMPROVEMENT = 0.477  # on SPCL, as the paper reports it
+DRAWN, POINTS = ("sift", "orb"), (0, 104, 208, 312)  # in the figures: hand-made descriptors, and material points
+OURS = {"mmgsd_plain": "its own loss alone", "mmgsd": "a dense supervision besides, which the paper does not have"}
+HEADLINE = (
+    "mmgsd", "mmgsd_plain", "mmgsd_long", "mmgsd_fine_deep", "spcl_dense", "spcl", "unimodal", "pcl", "sift", "centre",
+)  # fmt: skip
+LONGER_ROWS = ("mmgsd", "mmgsd_deep", "mmgsd_long", "mmgsd_fine", "mmgsd_fine_deep", "mmgsd_muon")
 SEGMENTS = 25  # of a rope
 SHOWN = 0.95  # share of a method's errors that the axis of their distribution holds
+
+
+def read_points(preset: str) -> Reader:
+    """A reader of material points that a preset asks about."""
+    asked = choose_points(load_preset(preset).evaluate.points, N_POINTS)
+    return listed(among(asked, "the points that the preset asks about"))
+
+
+def check(paths: Paths, **options: Any) -> None:
+    """ValueError where test images are not rendered, or the models of the preset not trained."""
+    check_images(paths, OBJECTS)
+    models = load_preset(paths.preset).train.values()
+    check_made(paths, "03_train with run=True", [paths.model(m) / WEIGHTS for m in models])
+
+
+def run(
+    paths: Paths, *, overwrite: bool = False, drawn: Sequence[str] = DRAWN, points: Sequence[int] = POINTS
+) -> Path:
+    """Ask all models of the main table that are trained, hand-made descriptors and chance; rmse.json.
+
+    The figures get those ``drawn`` besides the four methods, and answers about material ``points`` of one example.
+    """
+    config, untrained = load_preset(paths.preset), evaluation.BASELINES + evaluation.CHANCE
+    asked, models = {}, {name: configure_study(config, name, "main") for name in OBJECTS}
+    weights = {name: {m: paths.model(model) / WEIGHTS for m, model in row.items()} for name, row in models.items()}
+    for name, row in models.items():
+        there = {m: model for m, model in row.items() if m == "mmgsd" or weights[name][m].is_file()}
+        how = (paths.dataset(name), config.evaluate)
+        asked[name] = {m: evaluation.evaluate_model(weights[name][m], *how, paths.queries(model.name),
+                                                    overwrite=overwrite) for m, model in there.items()}  # fmt: skip
+        asked[name] |= {m: evaluation.evaluate_baseline(m, *how, paths.queries(f"{name}-{m}"), overwrite=overwrite)
+                        for m in untrained}  # fmt: skip
+    stored = write_main_table(config, paths.root)
+    for name, files in asked.items():
+        queries = {m: evaluation.load_queries(path) for m, path in files.items()}
+        evaluation.check_same_questions(queries)
+        trained = {m: weights[name][m] for m in METHODS if m in files}
+        errors = {m: queries[m] for m in (*trained, *drawn, *evaluation.CHANCE)}
+        data, file = load_dataset(paths.dataset(name), "test"), paths.results / f"figures_{name}.safetensors"
+        gathered = figure_data.gather_figure_data(errors, trained, data, points=points)
+        figure_data.save_figure_data(figure_data.keep_stored(gathered, file, stored[name]), file)
+    return paths.results / "rmse.json"
+
+
+def list_drawn(results: Path) -> dict[str, Path]:
+    """{object: the file that figures are drawn from} of a preset's folder of results."""
+    return {name: results / f"figures_{name}.safetensors" for name in OBJECTS}
+
+
+def load_drawn(results: Path) -> dict[str, FigureData]:
+    """{object: what the figures are drawn from} of a preset's folder of results."""
+    return {name: load_figure_data(path) for name, path in list_drawn(results).items()}
+
+
+def describe_main(results: Results, *, methods: Iterable[str] = tuple(LABELS)) -> Table:
+    """The methods' errors with the paper's own, which are not of the smaller budget."""
+    theirs = {name: {"rmse_mean": error} for name, error in PAPER.items()}
+    table = describe_errors(results, methods=methods)
+    return dataclasses.replace(table, quoted={"*the paper's MMGSD, 3,500 images each*": theirs})
+
+
+def describe_presets(results: Mapping[str, Results]) -> Table:
+    """MMGSD's RMSE by preset, from {path of the results file: errors}."""
+    rows = {f"`{Path(path).parent}`": {name: errors[name]["mmgsd"]["rmse_mean"] for name in OBJECTS}
+            for path, errors in results.items()}  # fmt: skip
+    return describe_objects("preset", rows, ("MMGSD's RMSE px: cloth", "rope"), ".0f")
+
+
+def judge_rmse(results: Results, *, row: str = "mmgsd_plain") -> Claim:
+    """The paper's headline errors, of the paper's own loss alone."""
+    errors = {name: get(results, "rmse", name, row, "rmse_mean") for name in OBJECTS}
+    parts = tuple(is_at_least(PAPER[name], errors[name]) for name in OBJECTS)
+    claim = " and ".join(f"{PAPER[name]} px on {name}" for name in OBJECTS)
+    plain = row == "mmgsd_plain"
+    return Claim(
+        "rmse" if plain else "rmse-dense", f"MMGSD's error is {claim}; here with {OURS[row]}.",
+        "Ours is no larger; a part each object.", f"{list_errors(errors)}, one seed", parts,
+        ALL if plain else "`03_train`, `04_evaluate`", (row,),
+    )  # fmt: skip
+
+
+def judge_improvement(results: Results) -> Claim:
+    """The distance to the contrastive baseline, neither with dense supervision; other pairs are told beside."""
+
+    def gain(row: str, other: str, table: str = "rmse") -> dict[str, float | None]:
+        return {name: _compute_gain(get(results, table, name), row, other) for name in OBJECTS}
+
+    gains = gain("mmgsd_plain", "spcl")
+    mean = None if None in gains.values() else sum(gains.values()) / len(gains)
+    parts = (*(is_at_least(each, MARGIN) for each in gains.values()), is_at_least(mean, IMPROVEMENT))
+    others = {
+        "with dense supervision, below SPCL without": gain("mmgsd", "spcl"),
+        "both with it": gain("mmgsd", "spcl_dense"),
+        "the first at the studies' budget": gain("mmgsd", "spcl", "budget"),
+    }
+    beside = "".join(f"; {other}: {list_shares(row)}" for other, row in others.items() if any(row.values()))
+    return Claim(
+        "improvement", f"MMGSD's error is {100 * IMPROVEMENT:.1f} % below SPCL's on average.",
+        "With its own loss alone MMGSD is better, a part each object; the mean improvement is as large, a part.",
+        f"{list_shares(gains)}, mean {say(mean, 'percent')}{beside}; one seed each", parts,
+        ALL, ("mmgsd_plain", "mmgsd", "spcl", "spcl_dense"),
+    )  # fmt: skip
+
+
+def _compute_gain(methods: Mapping[str, Any] | None, method: str, other: str) -> float | None:
+    ours, theirs = (get(methods, name, "rmse_mean") for name in (method, other))
+    return None if ours is None or theirs is None else 1 - ours / theirs
+
+
+def _list_both(results: Results, method: str, unit: str = "") -> str:
+    return " and ".join(f"{results['rmse'][name][method]['rmse_mean']:.1f}{unit}" for name in OBJECTS)
+
+
+def _list_gains(results: Results, method: str, other: str) -> str:
+    return " and ".join(f"{100 * _compute_gain(results['rmse'][name], method, other):.0f} %" for name in OBJECTS)
+
+
+def count_findings(results: Results) -> dict[str, str]:
+    """The numbers of the study's findings."""
+    more = max(-_compute_gain(results["rmse"][name], "unimodal", "mmgsd") for name in OBJECTS)
+    return {
+        "plain": _list_both(results, "mmgsd_plain"), "gain": _list_gains(results, "mmgsd_plain", "spcl"),
+        "spcl": _list_gains(results, "mmgsd", "spcl"), "dense": _list_gains(results, "mmgsd", "spcl_dense"),
+        "unimodal": f"{100 * more:.0f} %", "deep": _list_both(results, "mmgsd_fine_deep", " px"),
+    }  # fmt: skip
+
+
+def draw_teaser(results: Path) -> Figure:
+    """A pair of the sample that needs no explanation, as the shipped weights answer it, whatever the results."""
+    root = find_root()
+    return plot_teaser({name: [figure_data.ask_plain(load_shipped(name), load_sample(root, name))] for name in OBJECTS})
+
+
+def compare_answers(drawn: Mapping[str, FigureData]) -> tuple[dict[str, dict[str, Match]], dict[str, np.ndarray]]:
+    """{object: {method: answer}} and true matches of the example's query about which the errors differ most."""
+    query = {name: figure_data.choose_contrast(data) for name, data in drawn.items()}
+    compared = {name: {m: match[query[name]] for m, match in data.answers.items()} for name, data in drawn.items()}
+    return compared, {name: data.true[query[name]] for name, data in drawn.items()}
+
+
+def draw_combined(results: Path) -> Figure:
+    """`plot_combined` of `compare_answers`."""
+    drawn = load_drawn(results)
+    return plot_combined(*compare_answers(drawn), {name: data.answers["mmgsd"] for name, data in drawn.items()})
+
+
+def draw_rmse_pdf(results: Path) -> Figure:
+    """`plot_rmse_pdf` of both objects."""
+    drawn = load_drawn(results)
+    return plot_rmse_pdf({name: data.errors for name, data in drawn.items()},
+                         {name: data.object_size_px for name, data in drawn.items()})  # fmt: skip
+
+
+def draw_spatial_rmse(results: Path) -> Figure:
+    """`plot_spatial_rmse` of both objects."""
+    return plot_spatial_rmse({name: data.errors for name, data in load_drawn(results).items()})
 
 
 @styled
@@ -92,30 +272,6 @@ def plot_spatial_rmse(
 
 
 @styled
-def plot_training(logs: Mapping[str, pd.DataFrame], *, columns: int = 4) -> Figure:
-    """Loss against step, a panel a model: ``logs`` {"cloth mmgsd": columns step, loss, seconds}, last word the method.
-
-    Losses of different methods have different scales. Dark: mean of a tenth of the steps.
-    """
-    check_filled("logs", logs)
-    columns = min(columns, len(logs))
-    rows = -(-len(logs) // columns)
-    figure, axes = plt.subplots(rows, columns, figsize=(PAGE_IN * columns / 4, 1.5 * rows), layout="constrained",
-                                squeeze=False)  # fmt: skip
-    for axis, (name, log) in zip(axes.flat, logs.items(), strict=False):
-        colour = get_colour(name.split()[-1])
-        axis.plot(log.step, log.loss, color=colour, alpha=0.3, lw=0.6)
-        axis.plot(log.step, log.loss.rolling(max(1, len(log) // 10), min_periods=1).mean(), color=colour)
-        title = " ".join(get_label(word, short=True) if word in ROWS else word.capitalize() for word in name.split())
-        axis.set(title=f"{title} · {log.seconds.iloc[-1] / 60:.1f} min", xlabel="Step")
-    for axis in axes[:, 0]:
-        axis.set_ylabel("Loss")
-    for axis in axes.flat[len(logs) :]:
-        axis.remove()
-    return finish_axes(figure)
-
-
-@styled
 def plot_combined(
     answers: Mapping[str, Mapping[str, Match]], true: Mapping[str, np.ndarray], inwards: Mapping[str, Match],
     *, sigma_px: float = 10.0,
@@ -170,13 +326,6 @@ def _draw_inwards(line: Sequence[Axes], match: Match) -> None:
         line[index + 1].set_title(f"{index + 1} · {match.entropy[index]:.1f} nats")
 
 
-def compute_object_size(masks: Sequence[np.ndarray]) -> float:
-    """Diagonal of the object's bounding box in px, mean over (H, W) bool masks."""
-    check_filled("masks", masks)
-    spans = [np.ptp(np.argwhere(mask), axis=0) + 1 for mask in masks]
-    return float(np.linalg.norm(spans, axis=1).mean())
-
-
 def compute_density(histogram: np.ndarray, step: float, *, bandwidth: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     """Centres (K,) and density (K,) of a histogram of values ≥ 0 in bins of width ``step``.
 
@@ -186,3 +335,30 @@ def compute_density(histogram: np.ndarray, step: float, *, bandwidth: float = 1.
     padded = np.pad(histogram, (0, int(np.ceil(5 * bandwidth / step))))
     density = gaussian_filter1d(padded / (padded.sum() * step), bandwidth / step, mode="reflect")
     return (np.arange(len(padded)) + 0.5) * step, density
+
+
+STUDY = Study(
+    "main", 10, run, check, "04_evaluate", ("rmse",),
+    lambda paths, **_: [paths.results / "rmse.json", *list_drawn(paths.results).values()],
+    tables={
+        "headline": Shown("paper/rmse.json", partial(describe_main, methods=HEADLINE)),
+        "paper": Shown("paper/rmse.json", describe_main, "main_table"),
+        "longer": Shown("paper/rmse.json", partial(describe_errors, methods=LONGER_ROWS)),
+        "quick": Shown("quick/rmse.json", describe_main),
+        "presets": Shown(("quick/rmse.json", "paper/rmse.json"), describe_presets),
+    },
+    figures={"teaser": draw_teaser, "combined": draw_combined, "rmse_pdf": draw_rmse_pdf,
+             "spatial_rmse": draw_spatial_rmse},
+    claims=(judge_rmse, partial(judge_rmse, row="mmgsd"), judge_improvement),
+    findings=(
+        Finding(1, "The paper's own loss", " has {plain} px on cloth and rope, {gain} below SPCL.",
+                "which-method-is-best", count_findings),
+        Finding(2, "With dense supervision", " MMGSD's error is {spcl} below SPCL's without it, {dense} with it.",
+                "which-method-is-best", count_findings),
+        Finding(4, "Telling all matches", " instead of one changes little: Unimodal has at most {unimodal} more error.",
+                "which-method-is-best", count_findings),
+        Finding(5, "More training", ", larger images and a deeper network take MMGSD to {deep}.",
+                "does-more-training-help", count_findings),
+    ),
+    compared=ERROR_MEASURES,
+)  # fmt: skip

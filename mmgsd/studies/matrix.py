@@ -47,6 +47,7 @@ from mmgsd.studies.models import (
 from mmgsd.studies.parameters import read_scheduler
 
 TABLES = ("budget", "robustness", "backbones")  # studies with a file of their own, of models under their rows' names
+ALL = "`.venv/bin/python -m mmgsd.studies.matrix paper`"  # as documents say it
 VALIDATIONS = 8  # RMSE on held-out simulations, in a model's log
 
 Task = TrainConfig | tuple[str, str]  # a model to train and ask, or an object and a baseline to ask
@@ -117,6 +118,46 @@ def run_tasks(tasks: list[Task], preset: Preset, root: Path, *, scheduler: str =
             after = next((futures.get(start.name) for start in reversed(_find_start(task, preset))), None)
             futures[name_task(task)] = client.submit(run_task, task, preset, root, after, pure=False, priority=-i)
         yield from (future.result() for future in wait_for_each(client, futures.values()))
+
+
+def train_and_ask(model: TrainConfig, paths: Paths, *, group: str = "", overwrite: bool = False) -> tuple[Path, Path]:
+    """Train a model and ask it the preset's questions, unless that is done: its weights, and the table of answers."""
+    data, config = paths.dataset(model.object), load_preset(paths.preset).evaluate
+    weights = train_model(model, data, paths.model(model), overwrite=overwrite)
+    how = {"group": group, "overwrite": overwrite}
+    return weights, evaluate_model(weights, data, config, paths.queries(model.name), **how)
+
+
+def choose_tasks(preset: Preset, *, study: str = "", seeds: int = 0, steps: int = 0) -> list[Task]:
+    """The models compared by ``seeds``; those of a ``study``, of so many ``steps`` each; or all of `RUN`."""
+    if seeds:
+        return list_repeats(preset, seeds, steps=steps)
+    if steps:
+        return [model for name in OBJECTS for model in configure_study(preset, name, study, steps=steps).values()]
+    return list_tasks(preset, (study,) if study else RUN)
+
+
+def run_matrix(
+    paths: Paths, tasks: list[Task] | None = None, *, study: str = "", seeds: int = 0, steps: int = 0,
+    scheduler: str = "",
+) -> Path:  # fmt: skip
+    """Train and ask what `choose_tasks` chooses, or some ``tasks`` of it; the results file, or the folder of all.
+
+    Tables are written after each model.
+    """
+    preset, root = load_preset(paths.preset), paths.root
+    tasks = choose_tasks(preset, study=study, seeds=seeds, steps=steps) if tasks is None else tasks
+    done = run_tasks(tasks, preset, root, scheduler=scheduler)
+    for name, rmse in ProgressBar(done, total=len(tasks), desc="models and baselines"):
+        ProgressBar.write(f"{name}: {rmse:.1f} px")
+        if seeds:
+            write_seed_table(preset, root, seeds, steps=steps)
+        elif steps:
+            write_study_table(preset, root, study, steps=steps)
+        else:
+            write_tables(preset, root)
+    kind = "seeds" if seeds else study
+    return paths.results / (f"{kind}_{steps}.json" if steps else f"{kind}.json") if kind else paths.results
 
 
 def write_tables(preset: Preset, root: Path) -> None:
@@ -233,24 +274,13 @@ def main() -> None:
         parser.error(f"--seeds and --steps must be positive, and --steps needs --seeds or --study {studies}")
     if args.study and args.seeds:
         parser.error("--study and --seeds are two different lists of models: give one of them")
-    preset, studies = load_preset(args.preset), (args.study,) if args.study else RUN
-    tasks = list_repeats(preset, args.seeds, steps=args.steps) if args.seeds else list_tasks(preset, studies)
-    if args.steps and not args.seeds:
-        keyed = [configure_study(preset, name, args.study, steps=args.steps) for name in OBJECTS]
-        tasks = [model for models in keyed for model in models.values()]
+    preset = load_preset(args.preset)
+    tasks = choose_tasks(preset, study=args.study, seeds=args.seeds, steps=args.steps)
     tasks = [task for task in tasks if args.only in name_task(task)]
     if not tasks:
         parser.error(f"--only {args.only!r}: no model or baseline of the preset {preset.name} has a name with that")
-    scheduler = read_scheduler("--scheduler", args.scheduler)
-    done = run_tasks(tasks, preset, find_root(), scheduler=scheduler)
-    for name, rmse in ProgressBar(done, total=len(tasks), desc="models and baselines"):
-        ProgressBar.write(f"{name}: {rmse:.1f} px")
-        if args.seeds:
-            write_seed_table(preset, find_root(), args.seeds, steps=args.steps)
-        elif args.steps:
-            write_study_table(preset, find_root(), args.study, steps=args.steps)
-        else:
-            write_tables(preset, find_root())
+    asked = {"study": args.study, "seeds": args.seeds, "steps": args.steps}
+    run_matrix(Paths(find_root(), preset.name), tasks, **asked, scheduler=read_scheduler("--scheduler", args.scheduler))
 
 
 if __name__ == "__main__":

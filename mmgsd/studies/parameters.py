@@ -18,6 +18,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, MutableMapp
 from pathlib import Path
 from typing import Any
 
+from mmgsd.checks import read_flag  # noqa: F401  # a reader as well
 from mmgsd.config import PRESETS, TrainConfig
 from mmgsd.paths import Paths, find_root, find_shipped
 from mmgsd.studies.models import list_rows

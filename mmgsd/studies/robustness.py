@@ -1,16 +1,24 @@
-"""Before and after: errors on clean and cluttered renders, and what is found in photographs."""
+"""What each part of the shipped models' training brings, on clean and cluttered renders and in photographs.
+
+`run` trains its models; what they do on cluttered renders is measured by `mmgsd.studies.shipped`, into its rows.
+"""
 
 from __future__ import annotations
+
+from functools import partial
 
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mmgsd.config import OBJECTS
+from mmgsd.config import OBJECTS, load_preset
 from mmgsd.figures.style import PAGE_IN, check_filled, finish_axes, styled
 from mmgsd.match.baselines import BASELINES, OPTIONAL
-from mmgsd.studies.models import get_colour, get_label
-from mmgsd.studies.shipped import Rows, get_photographs, list_names
+from mmgsd.studies.matrix import run_matrix
+from mmgsd.studies.models import get_colour, get_label, list_rows
+from mmgsd.studies.registry import Shown, Study
+from mmgsd.studies.shipped import RESULTS, Rows, describe_pictures, get_photographs, list_names
+from mmgsd.studies.table import Table, describe_errors
 
 PANELS = (  # a title, what is measured there, and times what
     ("Clean renders", "paper", "rmse_mean", 1.0, "RMSE (px)"),
@@ -20,6 +28,20 @@ PANELS = (  # a title, what is measured there, and times what
 COLOURS = {"": get_colour("shipped"), "paper": get_colour("mmgsd")}
 COLOURS |= {name: get_colour(name) for name in (*BASELINES, *OPTIONAL)}
 LABELS = {"": "MMGSD, shipped", "paper": "MMGSD, clean images only"}
+
+
+def describe_parts(rows: Rows) -> Table:
+    """`describe_pictures` of the models, each with one part of the training more than the one before."""
+    labels = {f"{object}-{row.name}": row.label for object in OBJECTS for row in list_rows("robustness")}
+    return describe_pictures(rows, {name: label for name, label in labels.items() if name in rows})
+
+
+def make_budget_sentence(rows: Rows) -> str:
+    """How much the models of `describe_parts` learnt from."""
+    row = next(row for row in rows.values() if "steps" in row)
+    images = load_preset(row["preset"]).render["cloth"]
+    return (f"Preset `{row['preset']}`: {row['steps']} steps each, from {images.train_images:,} images of a kind; "
+            f"{images.test_images} test images of each.")  # fmt: skip
 
 
 @styled
@@ -57,3 +79,13 @@ def _draw_bar(axis: Axes, place: float, name: str, value: float | None) -> None:
         return
     axis.barh(place, value, height=0.72, color=COLOURS[name.partition("@")[0].partition("-")[2]])
     axis.annotate(f"{value:.0f}", (value, place), xytext=(2, 0), textcoords="offset points", va="center", fontsize=6.5)
+
+
+STUDY = Study(
+    "robustness", 140, partial(run_matrix, study="robustness"),
+    tables={
+        "robustness": Shown("paper/robustness.json", describe_errors),
+        "parts": Shown(RESULTS, describe_parts),
+        "budget_of_parts": Shown(RESULTS, make_budget_sentence),
+    },
+)  # fmt: skip

@@ -17,9 +17,12 @@ killed call goes on.
 from __future__ import annotations
 
 import argparse
+import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import pandas as pd
 
 from mmgsd.checks import read_count
 from mmgsd.command import run_command
@@ -31,7 +34,9 @@ from mmgsd.measure.evaluation import read_results
 from mmgsd.measure.shipped import measure_baseline, measure_read, measure_weights, name_read
 from mmgsd.model.tensors import WEIGHTS
 from mmgsd.paths import Paths, find_root
-from mmgsd.studies.models import PAPER, ROWS, SHIPPED, configure_study, get_label
+from mmgsd.studies.models import PAPER, SHIPPED, configure_study, get_label
+from mmgsd.studies.registry import Shown, Study
+from mmgsd.studies.table import ERRORS, Table, make_page_table, say_value
 
 STUDIES = ("robustness", "backbones")
 RESULTS = "shipped.json"
@@ -73,9 +78,9 @@ def get_photographs(rows: Rows, name: str) -> Mapping[str, Any]:
     return found if found.get("marks") == like.get("marks") else {}
 
 
-def make_limits_table(rows: Rows) -> str:
-    """Markdown of what an answer of the shipped weights is worth, and costs, in a user's units."""
-    seen = (_format(rows[object].get("photographs"), "found@5%", 100, ".0f", " %") for object in SIDES)
+def describe_limits(rows: Rows) -> Table:
+    """What an answer of the shipped weights is worth, and costs, in a user's units."""
+    seen = (say_value(rows[object].get("photographs"), "found@5%", 100, ".0f", " %") for object in SIDES)
     slowest = rows[max(SIDES, key=lambda object: rows[object]["milliseconds"])]
     lines = {
         "it knows": "square cloths, and ropes whose ends look alike; anything else has to be learnt first",
@@ -86,48 +91,41 @@ def make_limits_table(rows: Rows) -> str:
                     "a GPU is not needed",
         "on a robot": "never tried",
     }  # fmt: skip
-    return "\n".join(["|  |  |", "|---|---|", *map(_join, lines.items())])
+    return make_page_table([" "], {name: [text] for name, text in lines.items()})
 
 
 def _tell_error(row: Mapping[str, Any], preset: str) -> str:
-    px, size = _format(row.get(preset), "rmse_mean", 1, ".0f", " px"), row.get("side_px")
-    share = _format(row.get(preset) if size else None, "rmse_mean", 100 / (size or 1), ".0f", " %")
+    px, size = say_value(row.get(preset), "rmse_mean", 1, ".0f", " px"), row.get("side_px")
+    share = say_value(row.get(preset) if size else None, "rmse_mean", 100 / (size or 1), ".0f", " %")
     return f"{row['object']} {px}, {share} of its {SIDES[row['object']]}"
 
 
-def make_pictures_table(rows: Rows) -> str:
-    """Markdown of errors on clean and cluttered renders and of what is found in photographs, a row a model."""
-    return _make_pictures_lines(
-        rows, {name: label_row(name) for object in OBJECTS for name in list_names(rows, object)}
-    )
-
-
-def _make_pictures_lines(rows: Rows, labels: Mapping[str, str]) -> str:
+def describe_pictures(rows: Rows, labels: Mapping[str, str] | None = None) -> Table:
+    """Errors on clean and cluttered renders and what is found in photographs, a row a model, or one of ``labels``."""
+    if labels is None:
+        labels = {name: label_row(name) for object in OBJECTS for name in list_names(rows, object)}
     found = "photographs: found", "spurious", "not answered", "best of the rest"
     found = found if any(get_photographs(rows, name) for name in labels) else ()
-    heads = ["", *(f"{word}: RMSE px" for word in SETS.values()), *found]
-    lines = [_join(heads), "|---" * len(heads) + "|"]
+    heads, lines = [*(f"{word}: RMSE px" for word in SETS.values()), *found], {}
     for name, label in labels.items():
-        errors = [_format(rows[name].get(preset), "rmse_mean", 1, ".1f") for preset in SETS]
         photographs = get_photographs(rows, name)
-        shares = [_say_interval(photographs, key) for key in ("found@5%", "spurious")]
-        unanswered = _format(photographs, "unanswered", 100, ".0f", " %")
-        best = _format(photographs, "best", 1, ".1f", " %")
-        object = name.partition("@")[0].partition("-")[0]
-        cells = [f"{object}, {label}", *errors, *shares, unanswered, best]
-        lines.append(_join(cells[: len(heads)]))
-    return "\n".join(lines)
+        cells = [say_value(rows[name].get(preset), "rmse_mean", 1, ".1f") for preset in SETS]
+        cells += [_say_interval(photographs, key) for key in ("found@5%", "spurious")]
+        cells.append(say_value(photographs, "unanswered", 100, ".0f", " %"))
+        cells.append(say_value(photographs, "best", 1, ".1f", " %"))
+        lines[f"{name.partition('@')[0].partition('-')[0]}, {label}"] = cells[: len(heads)]
+    return make_page_table(heads, lines)
 
 
 def _say_interval(photographs: Mapping[str, Any], key: str) -> str:
     """A share with its 95 % interval, where that is known."""
     low_high = (photographs.get("intervals") or {}).get(key)
     interval = " ({:.0f} to {:.0f})".format(*(100 * value for value in low_high)) if low_high else ""
-    return _format(photographs, key, 100, ".0f", " %") + interval
+    return say_value(photographs, key, 100, ".0f", " %") + interval
 
 
 def make_reading_sentence(rows: Rows) -> str:
-    """How all of `make_pictures_table` are read, and whether intervals of what two weights find overlap."""
+    """How all of `describe_pictures` are read, and whether intervals of what two weights find overlap."""
     said = [f"power {rows[object]['power']:g}, sharpness {rows[object]['sharpness']:g} ({object})"
             for object in OBJECTS]  # fmt: skip
     apart = [f"those of `{object}` and `{object}-paper` {_tell_apart(rows, object)}" for object in OBJECTS]
@@ -143,25 +141,16 @@ def _tell_apart(rows: Rows, object: str) -> str:
     return "overlap" if low <= other_high and other_low <= high else "do not overlap"
 
 
-def make_cloth_renders_table(rows: Rows) -> str:
-    """Markdown of the errors on others' renders of a cloth, a row the weights, and what the paper says of its own."""
-    lines = ["|  | RMSE px | median px | pck@20px |", "|---" * 4 + "|"]
-    for name in (find_alike(rows, f"cloth{kind}") for kind in SHIPPED.values()):
-        if found := rows.get(name, {}).get("cloth_renders"):
-            cells = [_format(found, key, 1, ".1f") for key in ("rmse_mean", "median")]
-            lines.append(_join([label_row(name), *cells, _format(found, "pck@20px", 100, ".0f", " %")]))
-    return "\n".join([*lines, f"| *the paper's MMGSD, on images like its training's* | *{PAPER['cloth']}* | – | – |"])
+def describe_cloth_renders(rows: Rows) -> Table:
+    """The errors on others' renders of a cloth, a row the weights, and what the paper says of its own."""
+    names = [find_alike(rows, f"cloth{kind}") for kind in SHIPPED.values()]
+    found = {label_row(name): {"": row} for name in names if (row := rows.get(name, {}).get("cloth_renders"))}
+    theirs = {"*the paper's MMGSD, on images like its training's*": {"": {"rmse_mean": PAPER["cloth"]}}}
+    return Table(" ", {"": [dataclasses.replace(column, optional=True) for column in ERRORS]}, found, quoted=theirs)
 
 
-def make_parts_table(rows: Rows) -> str:
-    """`make_pictures_table` of the study that adds one part of the training after another."""
-    parts = {name: row.label for name, row in ROWS.items() if "robustness" in row.studies}
-    found = {f"{object}-{name}": label for object in OBJECTS for name, label in parts.items()}
-    return _make_pictures_lines(rows, {name: label for name, label in found.items() if name in rows})
-
-
-def make_readings_table(rows: Rows) -> str:
-    """`make_pictures_table` of weights whose modes are read in more than one way, power and sharpness in the label."""
+def describe_readings(rows: Rows) -> Table:
+    """`describe_pictures` of weights whose modes are read in more than one way, power and sharpness in the label."""
     labels = {}
     for name in (name for name in sorted(rows) if "power" in rows[name]):
         weights, _, numbers = name.partition("@")
@@ -169,31 +158,22 @@ def make_readings_table(rows: Rows) -> str:
         row = rows[name]
         if (numbers or again) and {"photographs", *SETS} & row.keys():
             labels[name] = f"`{weights}`, power {row['power']:g}, sharpness {row['sharpness']:g}"
-    return _make_pictures_lines(rows, labels)
+    return describe_pictures(rows, labels)
 
 
-def make_budget_sentence(rows: Rows) -> str:
-    """How much the models of `make_parts_table` learnt from."""
-    row = next(row for row in rows.values() if "steps" in row)
-    images = load_preset(row["preset"]).render["cloth"]
-    return (f"Preset `{row['preset']}`: {row['steps']} steps each, from {images.train_images:,} images of a kind; "
-            f"{images.test_images} test images of each.")  # fmt: skip
-
-
-def make_knowledge_table(rows: Rows) -> str:
-    """Markdown of what shipped weights know beside the matches, and of how far they keep what they promise."""
+def describe_knowledge(rows: Rows) -> Table:
+    """What shipped weights know beside the matches, and how far they keep what they promise."""
     measures = {"mask IoU": "mask_iou", "seen": "auroc_visible", "on the object": "auroc_on_object",
                 "absent": "auroc_absent", "ECE of ellipses": "ece", "of confidences": "ece_confidence",
                 "within the 90 % radius": "within_radius"}  # fmt: skip
-    lines = [_join(["", *measures]), "|---" * (len(measures) + 1) + "|"]
-    for object in OBJECTS:
-        for name in (name for name in (object, f"{object}-paper") if "calibrated" in rows.get(name, {})):
-            for preset, word in SETS.items():
-                found = rows[name].get(preset, {})
-                found = {**found, **found.get("heads", {})}
-                cells = [_format(found, key, 1, ".3f" if "ece" in key else ".2f") for key in measures.values()]
-                lines.append(_join([f"`{name}`, {word}", *cells]))
-    return "\n".join(lines)
+    lines = {}
+    for name in (name for object in OBJECTS for name in (object, f"{object}-paper")):
+        for preset, word in SETS.items() if "calibrated" in rows.get(name, {}) else ():
+            found = rows[name].get(preset, {})
+            found = {**found, **found.get("heads", {})}
+            lines[f"`{name}`, {word}"] = [say_value(found, key, 1, ".3f" if "ece" in key else ".2f")
+                                          for key in measures.values()]  # fmt: skip
+    return make_page_table(list(measures), lines)
 
 
 def make_sources_sentence(rows: Rows) -> str:
@@ -202,17 +182,15 @@ def make_sources_sentence(rows: Rows) -> str:
     return SOURCES.format(sources=", ".join(f"`{name}`" for name in sources))
 
 
-def make_by_source_table(rows: Rows) -> str:
-    """Markdown of the photographs of each public repository, a row each: what the shipped weights find in them."""
-    lines = ["|  | questions | unanswered | found | at 10 % | spurious | best |", "|---" * 7 + "|"]
+def describe_sources(rows: Rows) -> Table:
+    """The photographs of each public repository, a row each: what the shipped weights find in them."""
+    lines = {}
+    shares = ("unanswered", "found@5%", "found@10%", "spurious")
     for object in OBJECTS:
         for name, said in rows[object]["photographs"]["sources"].items():
-            shares = [
-                _format(said, key, 100, ".0f", " %") for key in ("unanswered", "found@5%", "found@10%", "spurious")
-            ]
-            asked, best = _format(said, "queries", 1, "d"), _format(said, "best", 1, ".1f", " %")
-            lines.append(_join([f"{object}, `{name}`", asked, *shares, best]))
-    return "\n".join(lines)
+            asked, best = say_value(said, "queries", 1, "d"), say_value(said, "best", 1, ".1f", " %")
+            lines[f"{object}, `{name}`"] = [asked, *(say_value(said, key, 100, ".0f", " %") for key in shares), best]
+    return make_page_table(["questions", "unanswered", "found", "at 10 %", "spurious", "best"], lines)
 
 
 def make_counts_sentence(rows: Rows) -> str:
@@ -222,13 +200,9 @@ def make_counts_sentence(rows: Rows) -> str:
     return COUNTS.format(counts=counts, slowest=rows[slowest]["milliseconds"], hardware=rows[slowest]["hardware"])
 
 
-def _format(row: Mapping[str, Any] | None, key: str, scale: float, form: str, unit: str = "") -> str:
-    value = None if row is None else row.get(key)
-    return "–" if value is None else format(scale * value, form) + unit
-
-
-def _join(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(cells)} |"
+def read_reliability(rows: Rows, kind: str) -> dict[str, pd.DataFrame]:
+    """{object: reliability on clean renders}, of the ``kind`` "Gaussian" or "calibrated"."""
+    return {name: pd.DataFrame(rows[name]["paper"]["reliability"][kind]) for name in OBJECTS if name in rows}
 
 
 def measure_study(
@@ -259,17 +233,33 @@ def measure_study(
             for key, file in files.items()}  # fmt: skip
 
 
-def _measure(name: str, root: Path, args: argparse.Namespace) -> dict[str, dict[str, Any]]:
-    """The rows of a name that is asked for."""
+def measure_rows(
+    name: str, root: Path, *, photographs: Path | None = None, photographs_alone: bool = False,
+    cloth_renders: Path | None = None, preset: str = "paper", steps: int = 0, object: str = "",
+) -> dict[str, dict[str, Any]]:  # fmt: skip
+    """The rows of a name that is asked for, as the module says."""
     if name in STUDIES:
-        how = {"objects": (args.object,) if args.object else (), "steps": args.steps, "photographs": args.photographs}
-        return measure_study(name, root, load_preset(args.preset), **how)
-    how = {"photographs": args.photographs, "presets": () if args.photographs_alone else measured.SETS}
+        how = {"objects": (object,) if object else (), "steps": steps, "photographs": photographs}
+        return measure_study(name, root, load_preset(preset), **how)
+    how = {"photographs": photographs, "presets": () if photographs_alone else measured.SETS}
     if name in (*BASELINES, *OPTIONAL):
         rows = {f"{object}-{name}": measure_baseline(name, object, root, **how) for object in OBJECTS}
         return {name_read(key, row): row for key, row in rows.items()}
     measure = measure_read if "@" in name else measure_weights
-    return {name: measure(name, root, cloth_renders=args.cloth_renders, **how)}
+    return {name: measure(name, root, cloth_renders=cloth_renders, **how)}
+
+
+def run(paths: Paths, *, names: Sequence[str] = ("cloth", "rope", "cloth-paper", "rope-paper"), **how: Any) -> Path:
+    """Measure some names and put their rows into shipped.json; ``how`` is as `measure_rows` has it."""
+    out = paths.root / "data" / "results" / RESULTS
+    for name in names:
+        rows = measure_rows(name, paths.root, **how)
+        kept = read_results(out)
+        for key, row in rows.items():  # photographs are not at everybody's hand: a call without them keeps the row's
+            before = kept.get(key, {})
+            kept[key] = (before if before.get("sha256") == row.get("sha256") else {}) | row
+        print(f"{write_json(out, kept)}: {', '.join(rows)}")
+    return out
 
 
 def main() -> None:
@@ -289,16 +279,25 @@ def main() -> None:
     parser.add_argument("--preset", default="paper", choices=tuple(PRESETS), help="of the study (default: paper)")
     parser.add_argument("--steps", type=int, default=0, help="of each model of a study (default: the study's own)")
     parser.add_argument("--object", default="", choices=OBJECTS, help="of a study's models those of one object")
-    args = parser.parse_args()
-    root, args.steps = find_root(), read_count("--steps", args.steps)
-    out = root / "data" / "results" / RESULTS
-    for name in args.names:
-        rows = _measure(name, root, args)
-        kept = read_results(out)
-        for key, row in rows.items():  # photographs are not at everybody's hand: a call without them keeps the row's
-            before = kept.get(key, {})
-            kept[key] = (before if before.get("sha256") == row.get("sha256") else {}) | row
-        print(f"{write_json(out, kept)}: {', '.join(rows)}")
+    how = vars(parser.parse_args())
+    how["steps"] = read_count("--steps", how["steps"])
+    run(Paths(find_root(), how["preset"]), **how)
+
+
+STUDY = Study(
+    "shipped", 160, run, shows=lambda paths, **_: [paths.results.parent / RESULTS],
+    tables={
+        "limits": Shown(RESULTS, describe_limits),
+        "pictures": Shown(RESULTS, describe_pictures),
+        "readings": Shown(RESULTS, describe_readings),
+        "knowledge": Shown(RESULTS, describe_knowledge),
+        "sources": Shown(RESULTS, make_sources_sentence),
+        "by_source": Shown(RESULTS, describe_sources),
+        "counts": Shown(RESULTS, make_counts_sentence),
+        "alike": Shown(RESULTS, make_reading_sentence),
+        "cloth_renders": Shown(RESULTS, describe_cloth_renders),
+    },
+)  # fmt: skip
 
 
 if __name__ == "__main__":

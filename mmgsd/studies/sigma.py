@@ -1,23 +1,91 @@
-"""The study of σ, the width of the targets."""
+"""How wide a target should be: MMGSD with each σ, the std of a target's modes at the end of training."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
+import pandas as pd
 from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 
-from mmgsd.figures.style import (
-    COLUMN_IN,
-    check_filled,
-    finish_axes,
-    styled,
-)
-from mmgsd.studies.models import get_colour
+from mmgsd.config import OBJECTS, TrainConfig, load_preset
+from mmgsd.figures.style import COLUMN_IN, check_filled, finish_axes, styled
+from mmgsd.measure.evaluation import read_results
+from mmgsd.paths import Paths
+from mmgsd.progress import ProgressBar
+from mmgsd.studies.claims import Claim, get, is_better, say
+from mmgsd.studies.matrix import train_and_ask, write_sigma_table
+from mmgsd.studies.models import configure_study, get_colour, vary_sigma
+from mmgsd.studies.parameters import check_training
+from mmgsd.studies.registry import ERROR_MEASURES, Results, Shown, Study
+from mmgsd.studies.table import ERRORS, Table, collect_rows
 
 OTHER_SEED = re.compile(r"mmgsd-[1-9]")
+
+
+def list_models(preset: str, sigmas_px: Sequence[float] = (), *, steps: int = 0) -> list[TrainConfig]:
+    """A model for each object and σ (px), by default the preset's; 0 ``steps`` are those of the studies' budget."""
+    config = load_preset(preset)
+    rows = vary_sigma(sigmas_px or config.sigmas_px)
+    return [m for name in OBJECTS for m in configure_study(config, name, "sigma", rows, steps=steps).values()]
+
+
+def check(paths: Paths, *, sigmas_px: Sequence[float] = (), steps: int = 0, overwrite: bool = False) -> None:
+    """ValueError where images are missing."""
+    check_training(paths, list_models(paths.preset, sigmas_px, steps=steps), overwrite=overwrite)
+
+
+def run(paths: Paths, *, sigmas_px: Sequence[float] = (), steps: int = 0, overwrite: bool = False) -> Path:
+    """Train and ask each model; sigma.json, or of other ``steps`` sigma_4000.json."""
+    for model in ProgressBar(list_models(paths.preset, sigmas_px, steps=steps), desc="models"):
+        train_and_ask(model, paths, overwrite=overwrite)
+    write_sigma_table(load_preset(paths.preset), paths.root, sigmas_px, steps=steps)
+    return list_shown(paths, steps=steps)[0]
+
+
+def list_shown(paths: Paths, *, steps: int = 0, **_: Any) -> list[Path]:
+    """The results file of so many steps."""
+    return [paths.results / (f"sigma_{steps}.json" if steps else "sigma.json")]
+
+
+def tabulate(results: Results, measure: str = "rmse_mean") -> pd.DataFrame:
+    """A measure, a row for each σ and a column for each object."""
+    values = {name: {sigma: row[measure] for sigma, row in rows.items()} for name, rows in results.items()}
+    return pd.DataFrame(values).rename_axis("σ (px)")
+
+
+def tabulate_longer(folder: Path) -> pd.DataFrame:
+    """The mean errors with other steps than the studies', of a preset's folder of results: a row a file and object."""
+    found = {path.stem: read_results(path, depth=2) for path in sorted(folder.glob("sigma_*.json"))}
+    tables = {name: tabulate(results).T for name, results in found.items()}
+    return pd.concat(tables).rename_axis(columns="σ (px)") if tables else pd.DataFrame()
+
+
+def describe_sigma(results: Results) -> Table:
+    """MMGSD's errors against the std of its targets."""
+    widths = sorted({width for rows in results.values() for width in rows}, key=float)
+    return Table("σ px", {"": ERRORS}, collect_rows(results, {width: width for width in widths}), OBJECTS)
+
+
+def judge_sigma(results: Results) -> Claim:
+    """The width of the target."""
+    errors = {name: {s: row["rmse_mean"] for s, row in (get(results, "sigma", name) or {}).items()} for name in OBJECTS}
+    parts = tuple(is_better(row.get("1"), row[s]) for row in errors.values() for s in row if float(s) > 1) or (None,)
+    shown = [f"{n}: " + ", ".join(f"{say(e)} at {s}" for s, e in row.items()) for n, row in errors.items()]
+    return Claim(
+        "sigma", "A target of σ = 1 px is best; every wider one is worse.",
+        "The wider target's error is larger; a part each object and width.", f"{'; '.join(shown)}; one seed", parts,
+        runs="sigma",
+    )  # fmt: skip
+
+
+def draw_sigma(folder: Path) -> Figure:
+    """`plot_sigma_ablation` of a preset's results, and of its other seeds, where they are trained."""
+    results, seeds = (read_results(folder / f"{name}.json") for name in ("sigma", "seeds_1000"))
+    return plot_sigma_ablation(results, seeds=seeds)
 
 
 @styled
@@ -45,3 +113,13 @@ def plot_sigma_ablation(
         axis.margins(x=0.15)
     axes[0, 0].set_ylabel("RMSE of MMGSD (px)")
     return finish_axes(figure)
+
+
+STUDY = Study(
+    "sigma", 20, run, check, "05_sigma_ablation", ("sigma",), list_shown,
+    tables={
+        "sigma": Shown("paper/sigma.json", describe_sigma, "sigma_table"),
+        "sigma_4000": Shown("paper/sigma_4000.json", describe_sigma),
+    },
+    figures={"sigma_ablation": draw_sigma}, claims=(judge_sigma,), compared=ERROR_MEASURES,
+)  # fmt: skip

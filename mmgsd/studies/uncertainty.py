@@ -1,8 +1,9 @@
-"""Figures of `mmgsd.measure.uncertainty`, in the style of `mmgsd.figures.plots`: each returns a ``Figure``."""
+"""Does an answer know how wrong it is: entropy against error, ellipses that hold what they promise, hidden matches."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -10,15 +11,160 @@ from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mmgsd.figures.style import COLUMN_IN, add_legend, check_filled, finish_axes, styled
-from mmgsd.measure.uncertainty import LEVELS, compute_coverage, compute_risk_coverage, get_distances
-from mmgsd.studies.models import CHANCE_STYLES, get_line_style
+from mmgsd.config import METHODS, OBJECTS, TrainConfig, load_preset
+from mmgsd.figures.style import COLUMN_IN, add_legend, check_filled, finish_axes, save_figure, styled
+from mmgsd.match.matcher import find_weights
+from mmgsd.measure.evaluation import BASELINES, check_same_questions, evaluate_model, load_queries, write_results
+from mmgsd.measure.uncertainty import (
+    LEVELS,
+    compute_coverage,
+    compute_risk_coverage,
+    get_distances,
+    summarise_uncertainty,
+)
+from mmgsd.model.tensors import WEIGHTS, load_metadata
+from mmgsd.paths import Paths
+from mmgsd.studies.claims import NATS, RANKED, Claim, get, get_regions, is_above, is_at_least, say
+from mmgsd.studies.models import CHANCE_STYLES, SHIPPED, configure_model, get_line_style
+from mmgsd.studies.parameters import check_images, check_made
+from mmgsd.studies.registry import Experiment, Finding, Measure, Results, Shown, Study
+from mmgsd.studies.sample import PAPER_SIZE, ask_sample, load_sample, load_shipped
+from mmgsd.studies.table import LABELS, Column, Table, collect_rows
 
 CURVE_POINTS = 200  # of a risk-coverage curve: a PDF of all queries would be large
 _ORDER = ("mmgsd", "unimodal", "spcl", "pcl", "sift", "orb")
 _THIN = {"linestyle": (0, (4, 1.5)), "linewidth": 0.8}
 
 Tables = Mapping[str, Mapping[str, pd.DataFrame]]
+
+
+COLUMNS = {
+    "entropy and error": (
+        Column("spearman", "Spearman", "Spearman", ".2f"), Column("aurc", "AURC", "AURC px", of="aurc_random"),
+        Column("aurc_random", "mean"), Column("aurc_share", "share", form=".2f"),
+    ),
+    "coverage (%)": (
+        *(Column(f"coverage@{level}%", f"{level} %", "90 % ellipses hold" if level == 90 else "", ".0f", scale=100,
+                 changes=True) for level in (50, 90, 95)),
+        Column("ece", "ECE", "ECE", ".2f", changes=True),
+    ),
+    "AUROC": (Column("auroc_occluded", "occluded", "AUROC occluded", ".2f"),
+              Column("auroc_absent", "absent", form=".2f")),
+}  # fmt: skip
+
+
+def list_models(paths: Paths) -> list[TrainConfig]:
+    """The four methods' models, of both objects; all but MMGSD's only where they are trained."""
+    config = load_preset(paths.preset)
+    models = [configure_model(config, name, method) for name in OBJECTS for method in METHODS]
+    return [model for model in models if model.method == "mmgsd" or (paths.model(model) / WEIGHTS).is_file()]
+
+
+def check(paths: Paths, **options: object) -> None:
+    """ValueError where images, models or their calibrated answers are missing."""
+    check_images(paths, OBJECTS)
+    models, untrained = list_models(paths), [f"{name}-{method}" for name in OBJECTS for method in BASELINES]
+    check_made(paths, "03_train with run=True", [paths.model(model) / WEIGHTS for model in models])
+    check_made(paths, "04_evaluate with run=True", map(paths.queries, [*(m.name for m in models), *untrained]))
+
+
+def run(paths: Paths, *, classical: Sequence[str] = ("sift", "orb"), overwrite: bool = False) -> Path:
+    """Ask the models once more at temperature 1, as they left training; uncertainty.json, and two figures.
+
+    `mmgsd.studies.main` asked the calibrated ones. The figures have those hand-made descriptors that are ``classical``.
+    """
+    config = load_preset(paths.preset).evaluate
+    before, after = ({name: {} for name in OBJECTS} for _ in range(2))
+    for model in list_models(paths):
+        asked = (paths.model(model) / WEIGHTS, paths.dataset(model.object), config)
+        out = evaluate_model(*asked, paths.queries(f"{model.name}-uncalibrated"), temperature=1.0, overwrite=overwrite)
+        before[model.object][model.method] = load_queries(out)
+        after[model.object][model.method] = load_queries(paths.queries(model.name))
+    tables = {name: methods | {m: load_queries(paths.queries(f"{name}-{m}")) for m in BASELINES}
+              for name, methods in after.items()}  # fmt: skip
+    for name, methods in tables.items():
+        check_same_questions(methods | {f"{m}, uncalibrated": table for m, table in before[name].items()})
+    summary = {when: {o: {m: summarise_uncertainty(t) for m, t in methods.items()} for o, methods in asked.items()}
+               for when, asked in {"calibrated": tables, "temperature 1": before}.items()}  # fmt: skip
+    file = write_results(summary, paths.results / "uncertainty.json")
+    shown = {o: {m: t for m, t in ts.items() if m in (*METHODS, *classical)} for o, ts in tables.items()}
+    save_figure(plot_risk_coverage(shown), paths.figures / "risk_coverage")
+    save_figure(plot_calibration(before, after), paths.figures / "calibration")
+    return file
+
+
+def read_temperatures(study: Experiment) -> pd.DataFrame:
+    """What the heatmaps' logits are divided by, of the trained models or else of the shipped ones."""
+    weights = {(o, m): find_weights(o + SHIPPED[m]) for o in OBJECTS for m in PAPER_SIZE}
+    if study.runs:
+        weights = {(m.object, m.method): study.paths.model(m) / WEIGHTS for m in list_models(study.paths)}
+    return pd.Series({key: float(load_metadata(path)["temperature"]) for key, path in weights.items()}).unstack()
+
+
+def tabulate(results: Results) -> pd.DataFrame:
+    """The measures before and after the calibration, a row each of an object and a method."""
+    when = {"1 before": "temperature 1", "2 after": "calibrated"}
+    rows = {(o, m, w): v for w, key in when.items() for o, methods in results[key].items() for m, v in methods.items()}
+    columns = ["spearman", "aurc", "aurc_share", "coverage@50%", "coverage@90%", "coverage@95%", "ece"]
+    columns += ["auroc_occluded", "auroc_absent"]
+    return pd.DataFrame(rows).T.sort_index()[columns].astype(float)
+
+
+def tabulate_nearest(errors: Results) -> pd.DataFrame:
+    """Mean distance (px) to the nearest match of the most probable and of the narrowest mode, from rmse.json."""
+    rows = {(name, m): row for name, methods in errors.items() for m, row in methods.items() if m in METHODS}
+    return pd.DataFrame(rows).T[["nearest_mean", "best_mean"]].astype(float)
+
+
+def ask_surer_half(root: Path) -> pd.DataFrame:
+    """The mean error (px) of the shipped weights about the sample: of all queries, and of those with less entropy."""
+    rows = {}
+    for name, method in ((name, method) for name in OBJECTS for method in PAPER_SIZE):
+        table = ask_sample(load_shipped(name, method), load_sample(root, name))
+        seen = table[table.visible]
+        surer = seen[seen.entropy <= seen.entropy.median()]
+        rows[name, method] = {"all": seen.rmse_px.mean(), "surer half": surer.rmse_px.mean()}
+    return pd.DataFrame(rows).T
+
+
+def describe_uncertainty(results: Results) -> Table:
+    """Quality of the uncertainties; an arrow leads from temperature 1 to the calibrated one."""
+    before = results["temperature 1"]
+    joined = {name: {method: {**row, "before": get(before, name, method)} for method, row in methods.items()}
+              for name, methods in results["calibrated"].items()}  # fmt: skip
+    return Table("", COLUMNS, collect_rows(joined, LABELS), OBJECTS)
+
+
+def judge_entropy(results: Results) -> Claim:
+    """Entropy as a measure of uncertainty."""
+    ranks = {name: get(results, "uncertainty", "calibrated", name, "mmgsd", "spearman") for name in OBJECTS}
+    return Claim(
+        "entropy", "The heatmap's entropy measures uncertainty.",
+        f"Rank correlation of MMGSD's entropy and error of {RANKED} or more; a part each object.",
+        ", ".join(f"{name} {say(rank, 'share')}" for name, rank in ranks.items()),
+        tuple(is_at_least(rank, RANKED) for rank in ranks.values()), models=("mmgsd",),
+    )  # fmt: skip
+
+
+def judge_inward(results: Results) -> Claim:
+    """Where the uncertainty lies, as the symmetry study's model of c4 has it."""
+    nats = get_regions(results, "c4", "entropy")
+    corner, edge, interior = (nats.get(region) for region in ("corner", "edge", "interior"))
+    above = is_above(edge, corner), is_above(interior, corner)
+    least = False if False in above else None if None in above else True
+    shown = ", ".join(f"{region} {say(value, 'share')}" for region, value in nats.items())
+    return Claim(
+        "inward", "Uncertainty is least at the extremities and grows inwards.",
+        f"MMGSD's entropy is at least {NATS} nats lower at the cloth's corners than at edges and inside, a part, and "
+        "lower at edges than inside, a part.", f"nats: {shown}; studies' budget, one seed",
+        (least, is_above(interior, edge)), "`08_symmetry_study`", runs="symmetry",
+    )  # fmt: skip
+
+
+def count_findings(results: Results) -> dict[str, str]:
+    """The rank correlations."""
+    ranks = (results["uncertainty"]["calibrated"][name]["mmgsd"]["spearman"] for name in OBJECTS)
+    return {"ranks": " and ".join(f"{rank:.2f}" for rank in ranks)}
 
 
 @styled
@@ -124,3 +270,21 @@ def _draw_risk(axis: Axes, error: pd.Series, score: pd.Series, style: dict) -> N
 
 def _draw_coverage(axis: Axes, queries: pd.DataFrame, style: dict) -> None:
     axis.plot(100 * np.array(LEVELS), 100 * compute_coverage(get_distances(queries)), **style)
+
+
+STUDY = Study(
+    "uncertainty", 80, run, check, "06_uncertainty", ("uncertainty",),
+    lambda paths, **_: [paths.results / "uncertainty.json", paths.results / "rmse.json"],
+    tables={"uncertainty": Shown("paper/uncertainty.json", describe_uncertainty, "uncertainty_table")},
+    claims=(judge_entropy, judge_inward),
+    findings=(
+        Finding(7, "Entropy ranks errors", " by a rank correlation of {ranks}: the less certain can be refused.",
+                "does-an-answer-know-how-wrong-it-is", count_findings),
+    ),
+    compared={
+        "aurc": Measure(share=0.03, like="rmse_mean"),  # px: a mean of RMSE
+        "spearman": Measure(floor=0.05),  # no seeds are stored of this and the next two
+        "coverage@90%": Measure(floor=0.05),
+        "ece": Measure(floor=0.05),
+    },
+)  # fmt: skip

@@ -13,11 +13,11 @@ from mmgsd.fold.demonstration import Look, read_demonstration
 from mmgsd.fold.moves import Answer
 from mmgsd.fold.state import State, read_state, write_state
 from mmgsd.fold.tasks import GROUNDS, TASKS
-from mmgsd.report.results import load_results
 from mmgsd.studies import folding as rollouts
 from mmgsd.studies import policies
 from mmgsd.studies.folding import choose_shown, find_on_table, list_rollouts, run_folding, summarise_rollouts
 from mmgsd.studies.policies import POLICIES, SHIPPED, digest_policy, find_answering
+from mmgsd.studies.registry import load_results
 
 ASKED = [POLICIES["truth"], POLICIES["random"]]
 ROW, COLUMN = np.divmod(np.arange(625), 25)

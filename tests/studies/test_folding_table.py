@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from mmgsd.studies.folding_tables import make_folding_sentence, make_folding_table, make_grasp_table, make_starts_table
+from mmgsd.studies.folding import describe_folding, describe_starts, make_folding_sentence
+from mmgsd.studies.grasp import describe_grasps
+from mmgsd.studies.table import to_markdown
 
 ERRORS = {"edge-flat-plain-0": 0.01, "edge-wrinkled-plain-1": 0.07, "corner-flat-workspace-2": 0.02}
 
@@ -26,7 +28,7 @@ RESULTS = {
 
 
 def test_a_row_a_policy_with_the_interval_of_its_success() -> None:
-    lines = make_folding_table(RESULTS).splitlines()
+    lines = to_markdown(describe_folding(RESULTS)).splitlines()
     heads = "success | as true matches | error | beside MMGSD's | error of all"
     assert lines[0] == f"|  | cloth: {heads} | rope: {heads} |"
     rest = "3.1 % | +20.0 (+10.0 to +30.0) | 7.1 %"
@@ -36,7 +38,7 @@ def test_a_row_a_policy_with_the_interval_of_its_success() -> None:
 
 
 def test_grounds_and_starts_are_told_apart_of_all_rollouts() -> None:
-    lines = make_starts_table(RESULTS).splitlines()
+    lines = to_markdown(describe_starts(RESULTS)).splitlines()
     heads = ("plain", "workspace", "flat", "wrinkled", "corner")
     assert lines[0].startswith(f"|  | {' | '.join(f'cloth: {head}' for head in heads)} | rope: plain")
     assert lines[3] == "| MMGSD, modes that agree | 1 of 2 | 1 of 1 | 2 of 2 | 0 of 1 | – | – | – | – | – | – |"
@@ -46,13 +48,13 @@ def test_rollouts_that_a_policy_lacks_are_left_out_of_all() -> None:
     few = row(0.5)
     del few["rollouts"]["edge-flat-plain-0"]
     results = {"policies": {**RESULTS["policies"], "cloth": {**RESULTS["policies"]["cloth"], "spcl": few}}}
-    assert make_starts_table(results).splitlines()[2].startswith("| true matches | 1 of 1 | 1 of 1 |")
+    assert to_markdown(describe_starts(results)).splitlines()[2].startswith("| true matches | 1 of 1 | 1 of 1 |")
 
 
 def test_a_grasp_has_its_distance_and_what_it_lifts() -> None:
-    assert make_grasp_table({}) == "*Not measured yet.*"
+    assert describe_grasps({}) == "*Not measured yet.*"
     way = {"distance": mean(0.031), "beyond": mean(-0.02), "lifted": mean(0.5)}
-    assert make_grasp_table({"grasp": {"spcl": {"surest": way}}}).splitlines()[2:] == [
+    assert to_markdown(describe_grasps({"grasp": {"spcl": {"surest": way}}})).splitlines()[2:] == [
         "| SPCL, the surest corner | 3.1 % | −2.0 (−12.0 to +8.0) | 50 % (40 to 60) |"
     ]
 
@@ -70,5 +72,5 @@ def test_rollouts_of_which_none_counts_are_dashes() -> None:
     part = RESULTS["policies"]["cloth"]["truth"]["all"]
     rows = {"truth": {"all": part, "cautious": {"count": 0}, "beyond": {}, "rollouts": {}}}
     results = {"run": RESULTS["run"], "policies": {"cloth": rows, "rope": rows}}
-    assert make_folding_table(results).splitlines()[2] == f"| true matches |{' – |' * 10}"
+    assert to_markdown(describe_folding(results)).splitlines()[2] == f"| true matches |{' – |' * 10}"
     assert "0 of 10 rollouts count" in make_folding_sentence(results)

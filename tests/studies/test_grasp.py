@@ -13,9 +13,10 @@ from test_folding import FLAT, MATRIX, POSE
 from mmgsd.fold.state import State, read_state, write_state
 from mmgsd.fold.tasks import GROUNDS, STARTS
 from mmgsd.match.match import Match
+from mmgsd.paths import Paths
 from mmgsd.studies import folding as rollouts
 from mmgsd.studies import grasp
-from mmgsd.studies.grasp import choose_picks, find_middle, judge_grasp, list_grasps, run_grasps, summarise_grasps
+from mmgsd.studies.grasp import choose_picks, find_middle, judge_grasp, list_grasps, summarise_grasps
 
 ABOUT = {"object": "cloth", "task": "grasp", "start": "flat", "ground": "plain", "seed": 0, "fault": "", "look": 0,
          "mark": "", "thickness": 0.0}  # fmt: skip
@@ -106,7 +107,7 @@ def test_a_run_lifts_what_is_grasped_at_a_corner(tmp_path: Path, monkeypatch: py
     for module in (grasp, rollouts):
         monkeypatch.setattr(module, "run_jobs", run)
     monkeypatch.setattr(grasp, "load", lambda _: Sure())
-    results = json.loads(run_grasps("smoke", tmp_path, progress=False).read_text())
+    results = json.loads(run(Paths(tmp_path, "smoke"), progress=False).read_text())
     assert list(results) == list(grasp.MATCHERS)
     ways = results["mmgsd"]
     assert ways["surest"]["lifted"]["mean"] == 1 and ways["probable"]["lifted"]["mean"] == 0

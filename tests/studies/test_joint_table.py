@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from mmgsd.studies.joint import make_joint_sentence, make_joint_table
+from mmgsd.studies.joint import describe_joint, make_joint_sentence
+from mmgsd.studies.table import to_markdown
 
 SAID = {"questions": 6, "heaviest": 0.02, "possible": 0.5, "joint": 0.4, "any_joint": 0.35, "swaps_heaviest": 0.8,
         "swaps_joint": None}  # fmt: skip
@@ -11,7 +12,7 @@ ROWS = {"cloth": {"object": "cloth", "paper": {"all": SAID, "folded": SAID}, "wo
 
 
 def test_rows_are_object_set_and_state() -> None:
-    lines = make_joint_table(ROWS).splitlines()
+    lines = to_markdown(describe_joint(ROWS)).splitlines()
     assert [line.split(" | ")[0] for line in lines[2:]] == ["| cloth, clean", "| cloth, clean, folded",
                                                             "| cloth, cluttered"]  # fmt: skip
     assert lines[2] == "| cloth, clean | 2 % | 40 % | 35 % | 50 % | 80 % | – |"

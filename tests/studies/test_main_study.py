@@ -8,7 +8,7 @@ import pytest
 from heatmaps import make_match
 
 from mmgsd.measure.metrics import BIN_PX, ErrorSummary, summarise_errors
-from mmgsd.studies import main, sigma
+from mmgsd.studies import figure_data, main, sigma, training
 from mmgsd.studies.models import get_colour, get_line_style
 
 
@@ -116,7 +116,7 @@ def test_lines_that_lie_on_others_are_seen():
 
 def test_plot_training_has_a_panel_a_model():
     log = pd.DataFrame({"step": range(1, 6), "loss": [5.0, 4, 3, 2, 1], "seconds": range(60, 310, 60)})
-    figure = main.plot_training({"cloth mmgsd": log, "rope pcl": log, "rope mmgsd": log}, columns=2)
+    figure = training.plot_training({"cloth mmgsd": log, "rope pcl": log, "rope mmgsd": log}, columns=2)
     assert len(figure.axes) == 3
     assert figure.axes[0].lines[0].get_ydata().tolist() == [5, 4, 3, 2, 1]
     assert figure.axes[0].get_title() == "Cloth MMGSD · 5.0 min"
@@ -125,7 +125,7 @@ def test_plot_training_has_a_panel_a_model():
 def test_compute_object_size_is_the_mean_diagonal():
     mask = np.zeros((20, 20), bool)
     mask[2:5, 3:7] = True  # 3 x 4 px
-    assert main.compute_object_size([mask, mask]) == pytest.approx(5)
+    assert figure_data.compute_object_size([mask, mask]) == pytest.approx(5)
 
 
 @pytest.mark.parametrize("call", [
@@ -135,8 +135,8 @@ def test_compute_object_size_is_the_mean_diagonal():
     lambda: main.compute_density(np.zeros(3, int), 0.25),
     lambda: main.plot_spatial_rmse({}),
     lambda: sigma.plot_sigma_ablation({}),
-    lambda: main.plot_training({}),
-    lambda: main.compute_object_size([]),
+    lambda: training.plot_training({}),
+    lambda: figure_data.compute_object_size([]),
 ])  # fmt: skip
 def test_empty_input_is_an_error(call):
     with pytest.raises(ValueError, match="must not be empty"):

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
+from mmgsd.studies.robustness import describe_parts, make_budget_sentence
 from mmgsd.studies.shipped import (
+    describe_cloth_renders,
+    describe_knowledge,
+    describe_limits,
+    describe_pictures,
+    describe_readings,
+    describe_sources,
     list_names,
-    make_budget_sentence,
-    make_by_source_table,
-    make_cloth_renders_table,
     make_counts_sentence,
-    make_knowledge_table,
-    make_limits_table,
-    make_parts_table,
-    make_pictures_table,
     make_reading_sentence,
-    make_readings_table,
     make_sources_sentence,
 )
+from mmgsd.studies.table import to_markdown
 
 FOUND = {"photographs": 34, "found@5%": 0.512, "spurious": 0.25, "unanswered": 0.306, "best": 8.04, "marks": "new",
          "intervals": {"found@5%": [0.4, 0.62]}, "sources": {"a/b": {}, "c/d": {}}}  # fmt: skip
@@ -39,7 +39,7 @@ def test_rows_are_in_the_order_of_interest() -> None:
 
 
 def test_what_was_not_measured_is_a_dash() -> None:
-    lines = make_pictures_table(ROWS).splitlines()
+    lines = to_markdown(describe_pictures(ROWS)).splitlines()
     assert lines[2] == "| cloth, `cloth` | 21.0 | 21.0 | 51 % (40 to 62) | 25 % | 31 % | 8.0 % |"
     assert lines[3] == "| cloth, `cloth-paper` | 26.1 | 88.0 | – | – | – | – |"
     assert lines[4] == "| cloth, DAISY | 71.2 | – | – | – | – | – |"
@@ -55,7 +55,7 @@ def test_one_table_has_one_reading_and_one_set_of_marks() -> None:
         "rope": ROWS["rope"] | own,
     }  # fmt: skip
     assert list_names(rows, "cloth") == ["cloth", "cloth-paper@1,6", "cloth-imagenet@1,6"]
-    lines = make_pictures_table(rows).splitlines()
+    lines = to_markdown(describe_pictures(rows)).splitlines()
     assert lines[3:5] == ["| cloth, `cloth-paper` | – | – | 64 % | 25 % | 31 % | 8.0 % |",
                           "| cloth, ImageNet features | – | – | – | – | – | – |"]  # fmt: skip
     assert "power 1, sharpness 6 (cloth)" in make_reading_sentence(rows)
@@ -63,13 +63,13 @@ def test_one_table_has_one_reading_and_one_set_of_marks() -> None:
 
 def test_others_renders_are_beside_what_the_paper_says_of_its_own() -> None:
     found = {"rmse_mean": 31.71, "median": 27.7, "pck@20px": 0.35}
-    lines = make_cloth_renders_table(ROWS | {"cloth": ROWS["cloth"] | {"cloth_renders": found}}).splitlines()
+    lines = to_markdown(describe_cloth_renders(ROWS | {"cloth": ROWS["cloth"] | {"cloth_renders": found}})).splitlines()
     assert lines[2] == "| `cloth` | 31.7 | 27.7 | 35 % |" and "32.4" in lines[3] and len(lines) == 4
 
 
 def test_parts_are_told_one_after_another() -> None:
     rows = {"rope-mmgsd_heads": {"paper": SET}, "rope-mmgsd": {"paper": SET, "workspace": {"rmse_mean": 99.0}}}
-    lines = make_parts_table(rows | ROWS).splitlines()
+    lines = to_markdown(describe_parts(rows | ROWS)).splitlines()
     assert [line.partition(" | ")[0] for line in lines[2:]] == [
         "| rope, **MMGSD** (ours)",
         "| rope, the same, with heads",
@@ -84,7 +84,7 @@ def test_ways_of_reading_stand_beside_the_weights_own() -> None:
         "cloth@1,1": {**means, "paper": {"rmse_mean": 25.6}},
         "cloth": {**own, **ROWS["cloth"]},
     }  # fmt: skip
-    lines = make_readings_table(rows).splitlines()
+    lines = to_markdown(describe_readings(rows)).splitlines()
     assert lines[2:] == [
         "| cloth, `cloth`, power 1.5, sharpness 4 | 21.0 | 21.0 | 51 % (40 to 62) | 25 % | 31 % | 8.0 % |",
         "| cloth, `cloth`, power 1, sharpness 1 | 25.6 | – | – | – | – | – |",
@@ -98,7 +98,7 @@ def test_the_parts_budget_is_said() -> None:
 
 
 def test_knowledge_is_of_weights_alone() -> None:
-    lines = make_knowledge_table(ROWS).splitlines()
+    lines = to_markdown(describe_knowledge(ROWS)).splitlines()
     assert lines[2] == "| `cloth`, clean | 0.95 | 0.90 | 0.98 | – | 0.026 | 0.010 | 0.91 |"
     assert not any("daisy" in line.lower() for line in lines)
 
@@ -112,7 +112,7 @@ def test_sentences_name_the_sources_and_count_the_photographs() -> None:
 def test_each_repository_is_a_row_and_what_it_lacks_a_dash() -> None:
     found = {"queries": 12, "unanswered": 0.2, "found@5%": 0.4477, "found@10%": 0.83, "spurious": 0.3, "best": 11.96}
     rows = {"cloth": {"photographs": {"sources": {"a/b": found}}}, "rope": {"photographs": {"sources": {"c/d": {}}}}}
-    lines = make_by_source_table(rows).splitlines()
+    lines = to_markdown(describe_sources(rows)).splitlines()
     assert lines[2:] == [
         "| cloth, `a/b` | 12 | 20 % | 45 % | 83 % | 30 % | 12.0 % |",
         "| rope, `c/d` | – | – | – | – | – | – |",
@@ -120,8 +120,8 @@ def test_each_repository_is_a_row_and_what_it_lacks_a_dash() -> None:
 
 
 def test_limits_are_in_px_shares_of_the_side_and_milliseconds() -> None:
-    lines = make_limits_table(ROWS).splitlines()
+    lines = to_markdown(describe_limits(ROWS)).splitlines()
     assert "| mean error, clean renders | cloth 21 px, 7 % of its side; rope –, – of its length |" in lines
     assert "51 % of a cloth's corners" in lines[5] and "140 ms" in lines[6] and "never tried" in lines[7]
     unsized = ROWS | {"cloth": {key: value for key, value in ROWS["cloth"].items() if key != "side_px"}}
-    assert "cloth 21 px, – of its side" in make_limits_table(unsized)
+    assert "cloth 21 px, – of its side" in to_markdown(describe_limits(unsized))

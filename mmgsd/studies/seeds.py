@@ -1,0 +1,121 @@
+"""What is chance: the same trainings with other seeds, and which methods they tell from MMGSD."""
+
+from __future__ import annotations
+
+import statistics
+from pathlib import Path
+
+from scipy import stats
+
+from mmgsd.config import OBJECTS
+from mmgsd.paths import Paths
+from mmgsd.studies.claims import Claim, get, list_errors
+from mmgsd.studies.matrix import ALL, run_matrix
+from mmgsd.studies.registry import Finding, Results, Shown, Study
+from mmgsd.studies.table import LABELS, Table, describe_objects
+
+SEEDS = 3  # from which a spread over seeds is spoken of
+LEVEL = 0.05  # of p, from which seeds do not tell two methods apart
+
+
+def run(paths: Paths, *, seeds: int = SEEDS, steps: int = 0, scheduler: str = "") -> Path:
+    """Train and ask the models compared by seeds, with ``seeds`` each; 0 ``steps`` are the main table's."""
+    return run_matrix(paths, seeds=seeds, steps=steps, scheduler=scheduler)
+
+
+def list_seeds(rows: Results, method: str) -> list[float]:
+    """The errors of a method's seeds, from {"mmgsd-0": errors}."""
+    return [row["rmse_mean"] for key, row in rows.items() if key.rpartition("-")[0] == method]
+
+
+def describe_seeds(results: Results) -> Table:
+    """The mean and the std of the RMSE over seeds, from {object: {"mmgsd-0": errors}}, a method a row.
+
+    Marked where it differs from MMGSD's by `compare_seeds`: by an asterisk, or by a dagger where it did before Holm's
+    correction alone.
+    """
+    tested = compare_seeds(results)
+
+    def say(name: str, method: str) -> str | None:
+        said, (alone, corrected) = say_seeds(results.get(name, {}), method), tested.get((name, method), (1.0, 1.0))
+        return f"{said}{' *' if corrected < LEVEL else ' †' if alone < LEVEL else ''}" if said else None
+
+    seeds = {label: {name: say(name, method) for name in OBJECTS} for method, label in LABELS.items()}
+    return describe_objects("RMSE px: mean ± std (seeds)", {k: row for k, row in seeds.items() if any(row.values())})
+
+
+def compare_seeds(results: Results) -> dict[tuple[str, str], tuple[float, float]]:
+    """{(object, method): p of Welch's t-test against MMGSD's seeds, alone and by Holm's correction for all of them}.
+
+    Holm, "A simple sequentially rejective multiple test procedure" (1979). Of methods with two seeds or more.
+    """
+    alone = {}
+    for name, rows in results.items():
+        ours, methods = list_seeds(rows, "mmgsd"), dict.fromkeys(key.rpartition("-")[0] for key in rows)
+        for method in (m for m in methods if m != "mmgsd" and min(len(ours), len(list_seeds(rows, m))) > 1):
+            alone[name, method] = float(stats.ttest_ind(list_seeds(rows, method), ours, equal_var=False).pvalue)
+    corrected, least = {}, 0.0
+    for k, (key, p) in enumerate(sorted(alone.items(), key=lambda item: item[1])):
+        least = corrected[key] = max(least, min(1.0, (len(alone) - k) * p))
+    return {key: (p, corrected[key]) for key, p in alone.items()}
+
+
+def make_first_seed_sentence(results: Results) -> str:
+    """What the seed 0 of MMGSD, which other studies rest on, has beside its other seeds."""
+    each = {name: list_seeds(results[name], "mmgsd") for name in OBJECTS}
+    said = [f"{values[0]:.1f} px on {name} (others {', '.join(f'{v:.1f}' for v in values[1:])})"
+            for name, values in each.items()]  # fmt: skip
+    return f"The tables of budget, σ and symmetry rest on MMGSD's seed 0: {', '.join(said)}."
+
+
+def say_seeds(rows: Results, method: str) -> str | None:
+    """Mean, std of the sample, and how many: "54.6 ± 0.8 (3)"; no std of one, None of none."""
+    values = list_seeds(rows, method)
+    if len(values) < 2:
+        return f"{values[0]:.1f} (1)" if values else None
+    return f"{statistics.mean(values):.1f} ± {statistics.stdev(values):.1f} ({len(values)})"
+
+
+def judge_stable(results: Results) -> Claim:
+    """The contrastive training's instability, as the spread over seeds."""
+    errors = {m: {name: list_seeds(get(results, "seeds_1000", name) or {}, m) for name in OBJECTS}
+              for m in ("mmgsd", "spcl")}  # fmt: skip
+    spreads = {m: {name: statistics.stdev(values) if len(values) >= SEEDS else None for name, values in row.items()}
+               for m, row in errors.items()}  # fmt: skip
+    parts = tuple(None if None in (ours := spreads["mmgsd"][n], theirs := spreads["spcl"][n]) else theirs > ours
+                  for n in OBJECTS)  # fmt: skip
+    reference = {name: get(results, "rmse", name, "spcl_reference", "rmse_mean") for name in OBJECTS}
+    return Claim(
+        "stable", "SPCL's training is unstable; MMGSD's is more stable.",
+        f"Over {SEEDS} seeds or more, SPCL's error has the larger standard deviation; a part each object.",
+        f"std at the studies' budget, MMGSD: {list_errors(spreads['mmgsd'])}, SPCL: {list_errors(spreads['spcl'])}; "
+        f"in its reference setting, one seed, SPCL's error is {list_errors(reference)}", parts,
+        f"{ALL[:-1]} --seeds 3 --steps 1000`", runs="seeds_1000",
+    )  # fmt: skip
+
+
+def count_findings(results: Results) -> dict[str, str]:
+    """On which objects seeds tell SPCL from MMGSD, and SPCL with dense supervision, corrected for all compared."""
+    tested = compare_seeds(results["seeds_1000"])
+
+    def say_apart(method: str) -> str:
+        found = [name for name in OBJECTS if tested.get((name, method), (1.0, 1.0))[1] < LEVEL]
+        return {0: "on neither", len(OBJECTS): "on both"}.get(len(found), f"on the {' and '.join(found)} alone")
+
+    return {"apart": say_apart("spcl"), "apart_dense": say_apart("spcl_dense")}
+
+
+STUDY = Study(
+    "seeds", 30, run, results=("seeds_1000",),
+    tables={
+        "seeds_1000": Shown("paper/seeds_1000.json", describe_seeds),
+        "first_seed": Shown("paper/seeds_1000.json", make_first_seed_sentence),
+        "seeds_quick": Shown("quick/seeds.json", describe_seeds),
+    },
+    claims=(judge_stable,),
+    findings=(
+        Finding(3, "Seeds",
+                ", three at a smaller budget, tell MMGSD from SPCL {apart}, from SPCL with it {apart_dense}.",
+                "what-does-a-smaller-equal-budget-give", count_findings),
+    ),
+)  # fmt: skip
