@@ -20,7 +20,6 @@ class Video:
     frames: np.ndarray  # (T, H, W, 3) uint8
     xy: np.ndarray  # (T, P, 2) px
     visible: np.ndarray  # (T, P) bool
-    mask: np.ndarray  # (H, W) bool, of the first frame
 
 
 def turn_sample(object: str, index: int, *, count: int = 24, degrees: float = 180.0) -> Video:
@@ -41,5 +40,4 @@ def turn_sample(object: str, index: int, *, count: int = 24, degrees: float = 18
         frames.append(np.rint(moved * cut + ground * (1 - cut)).astype(np.uint8))
         places.append(xy @ matrix.T + affine[:, 2])
         seen.append(data.visible[index] & ((places[-1] >= 0) & (places[-1] <= (width - 1, height - 1))).all(1))
-        first = cut[..., 0] > 0.5 if share == 0 else first
-    return Video(np.stack(frames), np.stack(places), np.stack(seen), first)
+    return Video(np.stack(frames), np.stack(places), np.stack(seen))

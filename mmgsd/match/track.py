@@ -9,6 +9,7 @@ leave frames out, where their answers fit those before and after badly, at the p
 
 from __future__ import annotations
 
+import os
 from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ from scipy.optimize import linear_sum_assignment
 from mmgsd.images import check_mask, check_pixels, to_rgb
 from mmgsd.match.match import LIKELY, Match
 from mmgsd.match.matcher import Matcher, Pair
+from mmgsd.video import open_video
 
 MEMORY = 8  # frames that a step may start from
 STEP, FARTHEST = 0.05, 1.0  # by the object's extent: scale of a place's step from frame to frame, and of the longest
@@ -214,6 +216,7 @@ def follow(
 ) -> Iterator[Tracked]:
     """As `Matcher.follow`."""
     tracker, size = None, None
+    frames = open_video(frames) if isinstance(frames, str | os.PathLike) else frames
     for number, frame in enumerate(frames):
         image = to_rgb(frame, f"frame {number}")
         size = size or image.shape
