@@ -4,7 +4,8 @@ Each frame is matched with the first one, so no error adds up. A joint answer (`
 the points, and of places all over the object, into n maps, one a member of the symmetry; which of them is the object as
 it lay in the first frame no single frame can tell. It is the one that moved least: a Viterbi filter over frames, whose
 states are a frame's maps and whose steps are how all maps move together (Student's t, so parts may jump). A step may
-leave frames out, where their answers fit those before and after badly, at the price of a match anywhere.
+leave frames out, where their answers fit those before and after badly, at the price of a match anywhere. From frame to
+frame optical flow is exacter than any match: it carries the points, and the matches keep it from drifting.
 """
 
 from __future__ import annotations
@@ -16,12 +17,13 @@ from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
+import cv2
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from mmgsd.images import check_mask, check_pixels, to_rgb
 from mmgsd.match.match import LIKELY, Match
-from mmgsd.match.matcher import Matcher, Pair
+from mmgsd.match.matcher import Matcher, Pair, compute_scale
 from mmgsd.video import open_video
 
 MEMORY = 8  # frames that a step may start from
@@ -29,6 +31,12 @@ STEP, FARTHEST = 0.05, 1.0  # by the object's extent: scale of a place's step fr
 TAIL = 1.5  # exponent of the steps' density: Student's t with one degree of freedom in the plane, Cauchy's
 EVIDENCE = 10.0  # places that are worth as much as all, which move together
 ANYWHERE = -np.log(np.pi)  # log-density of a place anywhere within the object's extent
+DRIFT_PX = 0.5  # of flow in a frame, std, of an image as the model was taught with
+RETURN_PX = 1.0  # as near as flow there and back must come, of such an image
+ALIKE = 9.0  # neighbouring frames' modes err alike: so many count as one
+GATE = 3.0  # stds from a mode, beyond which flow and mode contradict each other
+DOUBT = 4.0  # by which flow's variance grows in a frame where they do
+PATIENCE = 6  # frames in which flow may be near another than the point's own mode
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +93,7 @@ class Tracker:
         self._matcher, self._memory, self._frames, self._seen = matcher, deque(maxlen=MEMORY), 0, 0
         self._counts: np.ndarray | None = None  # of places: how many like ones each has, (S,)
         self._columns: list[np.ndarray] = []  # and which members' maps show these
+        self._motion: _Motion | None = None
         if places is None:
             pair = matcher.prepare(image0, image0, mask0=mask0, mask1=mask0)
             self._image0, self._said0, self._mask0 = pair.image0, pair.said[0], pair.mask0
@@ -103,6 +112,7 @@ class Tracker:
         lain = np.full((*order.shape, 2), np.nan)
         lain[:, 0] = match.xy  # the member that leaves all as it is
         self._remember(lain, _start(order.shape[1]))
+        self._motion = _Motion(match.scale, (pair.image0, self._points))
 
     def update(self, image: Any, *, mask: Any = None) -> Tracked:
         """The points in the next frame, which is as large as those before; ``mask`` (H, W) bool is where it shows it.
@@ -110,9 +120,12 @@ class Tracker:
         ValueError for an image or a mask that `Matcher.match` refuses.
         """
         self._frames += 1
-        match, order = self._prepare(image, mask).match_everywhere(self._points)
+        pair = self._prepare(image, mask)
+        self._motion = self._motion or _Motion(compute_scale(pair.image1.shape[1::-1], self._matcher.size))
+        match, order = pair.match_everywhere(self._points)
         absent = 0.0 if match.absent is None else float(match.absent[0])
         if absent > LIKELY:
+            self._motion.forget()
             count = len(self._points) if self._counts is None else int(self._counts.sum())
             return Tracked(np.full((count, 2), np.nan), np.zeros(count), np.zeros(count), absent)
         modes = np.take_along_axis(match.modes, order[..., None], 1).astype(float)
@@ -150,17 +163,83 @@ class Tracker:
         self._memory.append(_Seen(self._frames, self._seen, modes, *found))
 
     def _take(self, match: Match, order: np.ndarray, sure: float, absent: float) -> Tracked:
-        """The answer that the maps, the first frame's first, give of the points."""
-        rows = np.arange(len(self._points))
-        order, taken = order[: len(rows)], match[: len(rows)]
-        visible = np.full(order.shape, np.nan) if taken.visible is None else taken.visible
-        values = [np.take_along_axis(v, order, 1) for v in (visible, taken.confidence() * sure)]
-        xy = np.take_along_axis(taken.modes, order[..., None], 1)
+        """The answer that the maps, in the first frame's ``order`` (R, n), give of the points."""
+        count, n = len(self._points), order.shape[1]
+        xy = np.take_along_axis(match.modes, order[..., None], 1)[:count]
         if self._counts is None:
-            return Tracked(xy[:, 0], *(value[:, 0] for value in values), absent)
-        self._columns = self._columns or [choose_apart(*pair) for pair in zip(xy, self._counts, strict=True)]
-        all_ = [np.concatenate([v[r, c] for r, c in enumerate(self._columns)]) for v in (xy, *values)]
-        return Tracked(*all_, absent)
+            rows, columns = np.arange(count), np.zeros(count, int)
+        else:
+            self._columns = self._columns or [choose_apart(*pair) for pair in zip(xy, self._counts, strict=True)]
+            rows, columns = np.repeat(np.arange(count), self._counts), np.concatenate(self._columns)
+        own_first = np.argsort(np.arange(n) != columns[:, None], axis=1, kind="stable")
+        order, match = np.take_along_axis(order[rows], own_first, 1), match[rows]
+        modes, spread = (np.take_along_axis(v, order[..., None], 1) for v in (match.modes, match.spread_px[..., None]))
+        places, chosen = self._motion.update(match.image1, modes.astype(float), spread[..., 0])
+        taken = np.arange(len(rows)), np.take_along_axis(order, chosen[:, None], 1)[:, 0]
+        visible = np.full(len(rows), np.nan) if match.visible is None else match.visible[taken]
+        return Tracked(places, visible, match.confidence()[taken] * sure, absent)
+
+
+class _Motion:
+    """Places of K points: by optical flow from the last frame, drawn to the modes that are found in each.
+
+    Modes of one frame err like those of the next, flow adds its errors up: a Kalman filter weighs one by the other.
+    Where flow does not come back, or leads away from all modes, and where the point's own mode has been another than
+    the one it is near for `PATIENCE` frames, it is put at its own mode.
+    """
+
+    def __init__(self, scale: float, start: tuple[np.ndarray, np.ndarray] | None = None) -> None:
+        self._scale = scale  # px of a frame by px of an image as the model was taught with
+        self._before: np.ndarray | None = None
+        if start is not None:
+            self._before, self._at = self._shrink(start[0]), start[1].astype(float)
+            self._variance, self._strikes = np.zeros(len(self._at)), np.zeros(len(self._at), int)
+
+    def _shrink(self, image: np.ndarray) -> np.ndarray:
+        size = [max(32, round(side / max(self._scale, 1))) for side in image.shape[1::-1]]
+        return cv2.resize(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)
+
+    def forget(self) -> None:
+        """The object is lost."""
+        self._before = None
+
+    def update(self, image: np.ndarray, modes: np.ndarray, spread: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Places (K, 2) px and the indices (K,) of the modes (K, n, 2) px, each one's own first, that they are near."""
+        rows, grey = np.arange(len(modes)), self._shrink(image)
+        if self._before is None:
+            self._at, self._variance = np.full((len(modes), 2), np.nan), np.zeros(len(modes))
+            self._strikes, self._before = np.zeros(len(modes), int), grey
+        factor = np.array(grey.shape[::-1]) / image.shape[1::-1]
+        moved, kept = flow_there_and_back(self._before, grey, (self._at + 0.5) * factor - 0.5)
+        moved = (moved + 0.5) / factor - 0.5
+        gap = np.nan_to_num(np.linalg.norm(modes - moved[:, None], axis=-1), nan=np.inf)  # (K, n)
+        near = gap.argmin(1)
+        variance, error = self._variance + (DRIFT_PX * self._scale) ** 2, spread[rows, near] ** 2
+        fits = kept & (gap[rows, near] < GATE * np.sqrt(variance + error))
+        self._strikes = np.where(fits & (near > 0), self._strikes + 1, 0)
+        gain = np.where(fits, variance / (variance + ALIKE * error), 0.0)
+        at = moved + gain[:, None] * np.nan_to_num(modes[rows, near] - moved)
+        variance = np.where(fits, (1 - gain) * variance, DOUBT * variance)
+        lost = (~kept | (self._strikes >= PATIENCE)) & np.isfinite(modes[:, 0]).all(1)
+        self._at = np.where(lost[:, None], modes[:, 0], at)
+        self._variance = np.where(lost, spread[:, 0] ** 2, variance)
+        self._before = grey
+        return self._at.copy(), np.where(lost | ~fits, 0, near)
+
+
+def flow_there_and_back(before: np.ndarray, after: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where points (K, 2) px of a grey image are in another one, and whether flow takes them back, (K,) bool.
+
+    OpenCV's pyramidal Lucas and Kanade; NaN stays NaN.
+    """
+    known = np.isfinite(points).all(1)
+    if not known.any():
+        return points.copy(), known
+    start = np.where(known[:, None], points, 0).astype(np.float32)[:, None]
+    moved, there, _ = cv2.calcOpticalFlowPyrLK(before, after, start, None)
+    back, again, _ = cv2.calcOpticalFlowPyrLK(after, before, moved, None)
+    near = np.linalg.norm((back - start)[:, 0], axis=1) < RETURN_PX
+    return np.where(known[:, None], moved[:, 0], np.nan), known & near & (there & again > 0)[:, 0]
 
 
 @dataclass(frozen=True, eq=False)
