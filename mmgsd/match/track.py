@@ -27,13 +27,13 @@ from mmgsd.match.matcher import Matcher, Pair, compute_scale
 from mmgsd.video import open_video
 
 MEMORY = 8  # frames that a step may start from
-STEP, FARTHEST = 0.05, 1.0  # by the object's extent: scale of a place's step from frame to frame, and of the longest
-TAIL = 1.5  # exponent of the steps' density: Student's t with one degree of freedom in the plane, Cauchy's
+PACES, FARTHEST = (0.03, 0.1, 0.3), 1.0  # by the object's extent: stds of a step from frame to frame, of the longest
+TAIL = 3.0  # exponent of the steps' density in the plane: Student's t with four degrees of freedom
 EVIDENCE = 10.0  # places that are worth as much as all, which move together
 ANYWHERE = -np.log(np.pi)  # log-density of a place anywhere within the object's extent
 DRIFT_PX = 0.5  # of flow in a frame, std, of an image as the model was taught with
 RETURN_PX = 1.0  # as near as flow there and back must come, of such an image
-ALIKE = 9.0  # neighbouring frames' modes err alike: so many count as one
+ALIKE = 4.0  # neighbouring frames' modes err alike: so many count as one
 GATE = 3.0  # stds from a mode, beyond which flow and mode contradict each other
 DOUBT = 4.0  # by which flow's variance grows in a frame where they do
 PATIENCE = 6  # frames in which flow may be near another than the point's own mode
@@ -90,6 +90,8 @@ class Tracker:
     ) -> None:
         if (xy is None) == (places is None):
             raise ValueError("either xy or places must be given, got " + ("none" if xy is None else "both"))
+        if places is not None and mask0 is not None:
+            raise ValueError("mask0 must be None where places are given, not pixels")
         self._matcher, self._memory, self._frames, self._seen = matcher, deque(maxlen=MEMORY), 0, 0
         self._counts: np.ndarray | None = None  # of places: how many like ones each has, (S,)
         self._columns: list[np.ndarray] = []  # and which members' maps show these
@@ -261,14 +263,17 @@ def _start(n: int) -> tuple[np.ndarray, np.ndarray]:
 def compare_maps(before: np.ndarray, after: np.ndarray, age: int) -> np.ndarray:
     """(n, n) mean log-density that a map of (R, n, 2) px before moved to one after, ``age`` frames later.
 
-    In units of the object's extent; NaN places do not count, and a map without any is as good as any other.
+    In units of the object's extent; NaN places do not count, and a map without any is as good as any other. How fast
+    the object moves is not known: the pace counts that makes all maps together likeliest.
     """
-    extent = np.sqrt(np.nanmean(np.sum((after - np.nanmean(after, (0, 1))) ** 2, -1)))
-    scale = min(STEP * age, FARTHEST) * max(float(extent), 1e-6)
-    squared = np.sum((after[:, None] - before[:, :, None]) ** 2, -1) / scale**2  # (R, n, n)
-    density = np.log(extent**2 / (2 * np.pi * scale**2)) - TAIL * np.log1p(squared)
-    known = np.isfinite(density)
-    return np.where(known, density, 0.0).sum(0) / np.maximum(known.sum(0), 1)
+    extent = max(float(np.sqrt(np.nanmean(np.sum((after - np.nanmean(after, (0, 1))) ** 2, -1)))), 1e-6)
+    squared = np.sum((after[:, None] - before[:, :, None]) ** 2, -1) / extent**2  # (R, n, n)
+    known, found = np.isfinite(squared), []
+    for pace in PACES:
+        scale = min(pace * age, FARTHEST)
+        density = -np.log(2 * np.pi * scale**2) - TAIL * np.log1p(squared / (2 * TAIL - 2) / scale**2)
+        found.append(np.where(known, density, 0.0).sum(0) / np.maximum(known.sum(0), 1))
+    return max(found, key=lambda likelihood: likelihood[linear_sum_assignment(-likelihood)].sum())
 
 
 def assign_others(likelihood: np.ndarray, j: int, k: int) -> tuple[np.ndarray, float]:
@@ -303,6 +308,5 @@ def follow(
             raise ValueError(f"frames must be as large as the first one, {size[1]} x {size[0]} px, got "
                              f"{image.shape[1]} x {image.shape[0]} px for frame {number}")  # fmt: skip
         if tracker is None:
-            given = {"places": find} if xy is None and find is not None else {"image0": image, "xy": xy, "mask0": mask0}
-            tracker = Tracker(matcher, **given)
+            tracker = Tracker(matcher, image, xy, places=find, mask0=mask0)
         yield tracker.update(image)
