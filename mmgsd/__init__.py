@@ -15,12 +15,14 @@ if TYPE_CHECKING:
     from mmgsd.match.camera import compute_rays
     from mmgsd.match.match import Match
     from mmgsd.match.matcher import Matcher, load
+    from mmgsd.match.track import Track, Tracker
     from mmgsd.paths import find_samples
 
 __version__ = "0.1.0"
-__all__ = ["Match", "Matcher", "compute_rays", "find_samples", "load", "read_image"]
+__all__ = ["Match", "Matcher", "Track", "Tracker", "compute_rays", "find_samples", "load", "read_image"]
 _PLACES = {"Match": "match.match", "Matcher": "match.matcher", "compute_rays": "match.camera", "find_samples": "paths",
            "load": "match.matcher", "read_image": "images"}  # fmt: skip
+_PLACES |= dict.fromkeys(("Track", "Tracker"), "match.track")
 
 
 def __getattr__(name: str) -> Any:

@@ -35,8 +35,8 @@ def main(arguments: list[str] | None = None) -> None:
         return args.run(args)
     try:
         args.run(args)
-    except KeyboardInterrupt:
-        parser.exit(130, f"stopped: {_say_kept(args)}\n")
+    except KeyboardInterrupt as stopped:
+        parser.exit(130, f"stopped: {stopped or _say_kept(args)}\n")
     except BrokenPipeError:  # who reads the output has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (ValueError, FileNotFoundError, IsADirectoryError, PermissionError) as error:
@@ -72,6 +72,7 @@ def make_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="command")
     _add_match(commands.add_parser("match", help="find all matches of pixels of an image in others", epilog=EXAMPLE))
     _add_find(commands.add_parser("find", help="find places of the object by name, without a first image"))
+    _add_track(commands.add_parser("track", help="follow points of the first frame through a video, each as itself"))
     _add_segment(commands.add_parser("segment", help="write where an image shows the object"))
     _add_measure(commands.add_parser("measure", help="measure on photographs with marked corners or ends"))
     _add_fold(commands.add_parser("fold", help="say where to pick and place in a picture, as a demonstration did"))
@@ -136,6 +137,19 @@ def _add_find(find: argparse.ArgumentParser) -> None:
     find.add_argument("--out", type=_parse_picture, metavar="FILE", help="draw the answer (png, jpg, pdf or svg)")
     find.add_argument("--json", action="store_true", help="print the answer as JSON")
     find.set_defaults(run=cli.find)
+
+
+def _add_track(track: argparse.ArgumentParser) -> None:
+    track.add_argument("video", type=Path, help="a video, an animated GIF or WebP, or a folder of frames")
+    points = track.add_mutually_exclusive_group(required=True)
+    points.add_argument("--xy", type=_parse_pixel, action="append", metavar="X,Y",
+                        help="column,row px in the first frame; may be given several times")  # fmt: skip
+    points.add_argument("--find", type=_parse_place, action="append", metavar="PLACE",
+                        help="instead, places as the command find takes them, such as corners")  # fmt: skip
+    track.add_argument("--mask0", type=Path, metavar="FILE", help="brighter than half on the first frame's object")
+    track.add_argument("--out", type=Path, required=True, metavar="PLACE",
+                       help="what to write: .csv, .json, .mp4, .webm or .avi, or a folder for several")  # fmt: skip
+    track.set_defaults(run=cli.track)
 
 
 def _add_fold(fold: argparse.ArgumentParser) -> None:

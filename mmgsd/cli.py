@@ -19,6 +19,7 @@ import mmgsd
 from mmgsd.files import write_bytes, writing
 from mmgsd.images import check_pixels, list_images, read_mask
 from mmgsd.match.describe import describe_answer, format_query
+from mmgsd.match.match import LIKELY
 
 DPI = 150  # of a picture
 NAMED = 10  # of what is left out of a folder
@@ -185,6 +186,38 @@ def save_picture(figure: Any, path: Path) -> None:
     """A figure, as a file of the kind that its name ends with."""
     with writing(path) as aside:
         figure.savefig(aside, format=path.suffix[1:].lower(), dpi=DPI, bbox_inches="tight", pad_inches=0.05)
+
+
+def track(args: argparse.Namespace) -> None:
+    """Follow points through a video; what is interrupted keeps the frames that were finished."""
+    from mmgsd.match.recording import list_outputs, recording
+    from mmgsd.progress import ProgressBar
+    from mmgsd.video import open_video
+
+    video, outputs = open_video(args.video), list_outputs(args.out)
+    if args.video.resolve() in (path.resolve() for path in outputs):
+        raise ValueError(f"--out must not be the video itself, got {args.out}")
+    images, frames = itertools.tee(video)
+    mask0 = args.mask0 and read_mask(args.mask0, next(iter(video)).shape[:2])
+    followed = mmgsd.load(args.weights).follow(frames, args.xy, find=args.find, mask0=mask0)
+    absent, stopped = [], None
+    written = " and ".join(map(str, outputs))
+    with recording(outputs, video.rate) as record:
+        try:
+            for one in ProgressBar(followed, desc="track", unit="frame", total=video.count):
+                record(next(images), one)
+                absent.append(one.absent > LIKELY)
+        except (Exception, KeyboardInterrupt) as error:
+            if not absent:
+                raise
+            stopped = error
+    if isinstance(stopped, KeyboardInterrupt):
+        raise KeyboardInterrupt(f"{written} hold the first {len(absent)} frames")
+    print(f"{written}: {len(absent)} frames, the object is not seen in {sum(absent)} of them", flush=True)
+    if stopped:
+        raise stopped
+    if all(absent):
+        raise RuntimeError(f"none of the frames shows the object that {args.weights} knows")
 
 
 def segment(args: argparse.Namespace) -> None:

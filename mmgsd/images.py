@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image, ImageOps, UnidentifiedImageError
+from PIL import Image, ImageOps, ImageSequence, UnidentifiedImageError
 
 CHANNELS = (1, 3, 4)  # grey, RGB, RGBA
 MAX_ASPECT = 16  # longer side by shorter side, beyond which too few of the network's cells lie across
@@ -40,6 +40,15 @@ def read_image(path: Path | str) -> np.ndarray:
     if not (path.stat().st_size if source is path else source.getbuffer().nbytes):
         raise ValueError(f"{path} is empty: get the image anew")
     return _decode(source, str(path))
+
+
+def read_animation(path: Path | str) -> Iterator[np.ndarray]:
+    """The pictures (H, W, 3) uint8 RGB of an animated GIF, WebP or PNG, one by one; ValueError for a file of one."""
+    with _naming(str(path)), Image.open(path) as image:
+        if getattr(image, "n_frames", 1) < 2:
+            raise _NamedError(f"{path} is a single image: give a video, or a folder of images")
+        for frame in ImageSequence.Iterator(image):
+            yield np.array(frame.convert("RGB"))
 
 
 def find_beside(path: Path, name: str) -> Path:
@@ -72,6 +81,11 @@ def list_images(folder: Path | str) -> list[Path]:
     if not found:
         raise ValueError(f"{folder} holds no image: its files must end as images do, with .png, .jpg, .webp, .tif …")
     return found
+
+
+def is_image(path: Path) -> bool:
+    """Whether a file's name ends as those of images do."""
+    return path.suffix.lower() in _list_endings()
 
 
 @cache

@@ -16,7 +16,7 @@ import mmgsd
 PACKAGE = Path(mmgsd.__file__).parent
 MODULES = {".".join(p.relative_to(PACKAGE.parent).with_suffix("").parts): p for p in PACKAGE.rglob("*.py")}
 ATTENDANTS = ("checks", "config", "files", "images", "dataset", "dataset_format", "symmetry", "numerics", "paths",
-              "progress", "command", "cluster")  # fmt: skip  # modules that every package but figures may import
+              "progress", "command", "cluster", "video")  # fmt: skip  # every package but figures may import
 LAYERS = {  # package: others that it may import, at the head of a module or in a function
     "model": (),
     "match": ("model",),

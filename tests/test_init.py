@@ -15,7 +15,7 @@ import mmgsd
 from mmgsd.config import OBJECTS
 from mmgsd.match.match import Best
 
-PUBLIC = ["Match", "Matcher", "compute_rays", "find_samples", "load", "read_image"]
+PUBLIC = ["Match", "Matcher", "Track", "Tracker", "compute_rays", "find_samples", "load", "read_image"]
 
 
 def test_completion_and_help_show_every_public_name() -> None:
@@ -39,7 +39,7 @@ def test_type_checkers_are_told_of_every_public_name(name: str) -> None:
     assert getattr(mmgsd, name).__module__ == f"mmgsd.{place}" and package.with_name("py.typed").is_file()
 
 
-@pytest.mark.parametrize("kind", [mmgsd.Match, Best])
+@pytest.mark.parametrize("kind", [mmgsd.Match, mmgsd.Track, Best])
 def test_every_field_of_an_answer_is_documented(kind: type) -> None:
     for field in dataclasses.fields(kind):
         assert f"``{field.name}``" in kind.__doc__, field.name

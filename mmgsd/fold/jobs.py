@@ -19,11 +19,12 @@ from mmgsd.checks import check, check_choice, read_count, read_flag
 from mmgsd.cluster import run_tasks
 from mmgsd.files import DamagedFileError, scratch_folder, set_aside, write_bytes
 from mmgsd.fold.state import State, read_state
-from mmgsd.fold.tasks import GROUNDS, STARTS, Move, Task, find_task, place_truth
+from mmgsd.fold.tasks import GROUNDS, MOTIONS, STARTS, Move, Task, find_task, place_truth
 from mmgsd.progress import ProgressBar
 from mmgsd.scene.stage import connect, run_job
 
-__all__ = ["State", "act_job", "demonstration_job", "look_job", "read_state", "run_jobs", "start_job", "true_moves"]
+__all__ = ["State", "act_job", "demonstration_job", "film_job", "look_job", "read_state", "run_jobs", "start_job",
+           "true_moves"]  # fmt: skip
 
 VERSION = 1  # to be raised where the same job gives another state than before
 JOBS_A_BATCH = 12  # a child process ends after so many at most: it takes seconds to start
@@ -70,6 +71,22 @@ def look_job(state: Path, again: int) -> dict:
     check("again", again, "at least 1", read_count("again", again) >= 1)
     job = {"kind": "look", "after": read_state(state).about["mark"], "again": int(again)}
     return _marked(job) | {"state": str(state)}
+
+
+def film_job(
+    state: Path, moves: Sequence[PixelMove], motion: str, *, frames: int, size: tuple[int, int] | None = None
+) -> dict:
+    """What a fixed camera sees of a motion of `MOTIONS` that begins with the state in a file.
+
+    Of ``moves`` as `act_job` has them, being made; ``frames`` pictures, at least 2, evenly over the time that it takes,
+    of ``size`` (width, height) px, none: as the state's. DamagedFileError where the file is no state; ValueError for
+    another motion.
+    """
+    check_choice("motion", motion, MOTIONS)
+    acted = {name: value for name, value in act_job(state, moves).items() if name in ("after", "moves")}
+    size = list(size or read_state(state).mask.shape[::-1])
+    film = {"kind": "film", "motion": motion, "frames": read_count("frames", frames, least=2), "size": size}
+    return _marked(film | acted) | {"state": str(state)}
 
 
 def true_moves(look: Sequence[Move], demonstrated: np.ndarray, state: State) -> list[PixelMove]:
@@ -129,7 +146,8 @@ def _is_whole(path: Path, job: dict) -> bool:
 def _run_missing(client: Client, jobs: dict[str, dict], files: dict[str, Path], progress: bool) -> None:
     names = list(jobs)
     threads = max(1, sum(client.nthreads().values()))
-    size = min(JOBS_A_BATCH, -(-len(names) // threads))
+    most = 1 if any(job["kind"] == "film" for job in jobs.values()) else JOBS_A_BATCH  # a film takes minutes
+    size = min(most, -(-len(names) // threads))
     batches = [names[i : i + size] for i in range(0, len(names), size)]
     tasks = {batch[0]: {name: _pack(jobs[name]) for name in batch} for batch in batches}
     bar = ProgressBar(total=len(names), desc="fold", unit="state", disable=not progress)

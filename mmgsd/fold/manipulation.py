@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,7 @@ from mmgsd.scene.objects import cloth, rope
 from mmgsd.scene.objects.meshes import SPACING
 from mmgsd.scene.objects.rope_shape import LENGTH, OwnPart, RopeShape, sample_rope
 from mmgsd.scene.rope_pull import pull_rope
-from mmgsd.scene.workspace.distractors import add_distractors
+from mmgsd.scene.workspace.distractors import add_distractors, add_occluder
 from mmgsd.scene.workspace.materials import paint_object
 from mmgsd.scene.workspace.surfaces import Site, add_surfaces
 from mmgsd.scene.workspace.view import draw_light, frame_points, sample_ground_points
@@ -50,6 +50,8 @@ FRICTION = 80.0  # of the table: what lies on it must not be dragged along by wh
 LAID_AT = 0.03  # m above the table, where grippers let go of a cloth
 MAX_STRETCH = 1.35  # of a rope, and of the 99th percentile of a cloth's edges: four layers in grippers reach 1.2
 LEAST_SEEN = 0.8  # share of the material points in the picture
+LEAN, CLEAR = 1.1, 0.02  # rad from upright that a gripper or a hand leans in a film; m between its tip and the object
+NO_TIPS: dict[str, np.ndarray] = {}
 
 Moves = Sequence[tuple[Sequence[float], Sequence[float]]]  # pick (x, y) and place (x, y), px
 
@@ -58,6 +60,8 @@ def run_job(job: dict[str, Any], out: Path) -> Path:
     """Make the state of a job of `mmgsd.fold.jobs` and write it to ``out``; ValueError for an unknown task."""
     if job["kind"] == "act":
         return write_state(out, act(read_state(job["state"]), job["moves"], job["mark"]))
+    if job["kind"] == "film":
+        return write_state(out, film(read_state(job["state"]), job))
     if job["kind"] == "look":
         return write_state(out, look_again(read_state(job["state"]), job["again"], job["mark"]))
     return write_state(out, begin(job))
@@ -163,10 +167,13 @@ def _find_stretch(share: float) -> str:
     return f"stretched to more than {MAX_STRETCH:g} of its length" if share > MAX_STRETCH else ""
 
 
-def move_cloth(vertices: np.ndarray, grasps: Sequence[tuple[Sequence[int], np.ndarray]]) -> np.ndarray:
+def move_cloth(
+    vertices: np.ndarray, grasps: Sequence[tuple[Sequence[int], np.ndarray]], *,
+    watched: list[np.ndarray] | None = None,
+) -> np.ndarray:  # fmt: skip
     """Vertices (1369, 3) m after groups of them, as (indices, shift (2,) m), were carried at once, let go and settled.
 
-    No grasp changes nothing. Physics may return vertices that are not finite.
+    No grasp changes nothing. Physics may return vertices that are not finite. ``watched`` is `cloth.simulate`'s.
     """
     if not grasps:
         return vertices
@@ -177,10 +184,10 @@ def move_cloth(vertices: np.ndarray, grasps: Sequence[tuple[Sequence[int], np.nd
         lift, low = max(0.05, LIFT * np.linalg.norm(shift)), vertices[group, 2].min()
         path = cloth.arc_path(np.append(shift, LAID_AT - low), lift, frames)
         grasped |= {vertex: cloth.Grasp(vertex, path) for vertex in group if vertex not in grasped}
-    carried = cloth.simulate(planar, vertices, list(grasped.values()), frames, friction=FRICTION)
+    carried = cloth.simulate(planar, vertices, list(grasped.values()), frames, friction=FRICTION, watched=watched)
     if not np.isfinite(carried).all():
         return carried
-    return cloth.simulate(planar, carried, [], SETTLE_FRAMES, friction=FRICTION)
+    return cloth.simulate(planar, carried, [], SETTLE_FRAMES, friction=FRICTION, watched=watched)
 
 
 def _grasp_cloth(vertices: np.ndarray, camera: Camera, moves: Moves) -> list[tuple[list[int], np.ndarray]]:
@@ -240,6 +247,58 @@ def meet_table(camera: Camera, xy: Sequence[float]) -> np.ndarray | None:
     return None if ray[2] > -1e-3 else eye[:2] - ray[:2] * (eye[2] / ray[2])
 
 
+# Films. -------------------------------------------------------------------------------------------------------------
+
+
+def film(state: State, job: dict[str, Any]) -> State:
+    """Looks of a motion from a state on, one after the other, as one state whose arrays have an axis of frames.
+
+    What physics spoils is said in ``fault``.
+    """
+    about = state.about | {"mark": job["mark"], "size": job["size"]}
+    paths, held = _move(state, job["moves"], job["frames"], turning=job["motion"] in ("turn", "hand"))
+    if not np.isfinite(paths).all():
+        paths, about["fault"] = np.repeat(state.vertices[None], len(paths), 0), "nowhere"
+    looks = []
+    for share, vertices in zip(np.linspace(0, 1, len(paths)), paths, strict=True):
+        tips = _find_tips(job["motion"], share, state.first, vertices[held])
+        looks.append(_look(vertices.astype(np.float32), state.first, about, tips=tips))
+    fixed = {"first", "intrinsics", "camera_pose", "about"}
+    arrays = {field.name: np.stack([getattr(look, field.name) for look in looks])
+              for field in dataclasses.fields(State) if field.name not in fixed}  # fmt: skip
+    return dataclasses.replace(looks[0], **arrays)
+
+
+def _move(state: State, moves: Moves, frames: int, *, turning: bool) -> tuple[np.ndarray, list[int]]:
+    """Vertices (frames, V, 3) m on their way, and which of them grippers hold."""
+    before, watched = state.vertices.astype(float), []
+    camera = Camera(state.intrinsics, state.camera_pose, state.mask.shape[::-1])
+    if turning:
+        middle = np.append(find_middle(before[:, :2]), 0.0)
+        angles = np.pi * np.linspace(0, 1, frames)
+        return np.stack([(before - middle) @ spin(angle).T + middle for angle in angles]), []
+    if state.about["object"] == "cloth":
+        grasps = _grasp_cloth(before, camera, moves)
+        move_cloth(before, grasps, watched=watched)
+        held = [group[0] for group, _ in grasps]
+    else:
+        grasps = _grasp_rope(before, state.about["thickness"], camera, moves)
+        pull_rope(before, state.about["thickness"], grasps, watched=watched)
+        held = [index for index, _ in grasps]
+    paths = [before, *watched]
+    return np.stack([paths[k] for k in np.linspace(0, len(paths) - 1, frames).round().astype(int)]), held
+
+
+def _find_tips(motion: str, share: float, first: np.ndarray, held: np.ndarray) -> dict[str, np.ndarray]:
+    """Where (K, 3) m the tips of grippers or of a hand are when a ``share`` of a film is over, by kind."""
+    if motion == "gripper":
+        return {"gripper": held}
+    if motion != "hand":
+        return {}
+    low, high = first[:, :2].min(0), first[:, :2].max(0)
+    return {"hand": np.array([[*(low + (high - low) * (0.5, 1.4 - 1.8 * share)), 0.1]])}
+
+
 # Looks. -------------------------------------------------------------------------------------------------------------
 
 
@@ -251,8 +310,13 @@ def look_again(state: State, again: int, job_hash: str) -> State:
     return _look(state.vertices, state.first, about)
 
 
-def _look(vertices: np.ndarray, first: np.ndarray | None, about: dict[str, Any]) -> State:
-    """Render and label the object; ``first`` (625, 3) m are the points of the rollout's first look, None for that."""
+def _look(
+    vertices: np.ndarray, first: np.ndarray | None, about: dict[str, Any], *, tips: Mapping[str, np.ndarray] = NO_TIPS
+) -> State:
+    """Render and label the object; ``first`` (625, 3) m are the points of the rollout's first look, None for that.
+
+    ``tips`` (K, 3) m of occluders that reach for it, by kind.
+    """
     scene = blender.reset_scene()
     deformed = _add_object(vertices.astype(float), about)
     points = deformed.points.astype(np.float32)
@@ -262,6 +326,10 @@ def _look(vertices: np.ndarray, first: np.ndarray | None, about: dict[str, Any])
     blender.setup_cycles(scene, camera.size, SAMPLES)
     blender.place_camera(scene, camera)
     visible = blender.find_visible(deformed, blender.build_bvh(deformed.mesh), camera)
+    for kind, places in tips.items():
+        for k, place in enumerate(places):
+            angle = np.pi / 2 + k * (np.pi / 3)  # so that they come from the picture's border, side by side
+            add_occluder(_stream(about, kind), kind, place + (0, 0, CLEAR), lean=LEAN, turn=angle)
     image, mask = _render(scene, deformed, room, camera, turn, about)
     xy = camera.project(deformed.points).astype(np.float32)
     visible &= _is_near(mask, xy)  # a thing may stand before it
@@ -293,7 +361,7 @@ def find_room(points: np.ndarray, task: Task) -> np.ndarray:
 
 def _draw_camera(room: np.ndarray, about: dict[str, Any]) -> tuple[Camera, float]:
     """A camera that sees the whole room, and its turn (rad) about z."""
-    rng, size = _stream(about, "camera"), IMAGE_SIZE[about["object"]]
+    rng, size = _stream(about, "camera"), tuple(about.get("size", IMAGE_SIZE[about["object"]]))
     if about["demonstration"]:
         return frame_points(rng, room, size, 0.0, 0.0, 0.85, 3.0, shift=0.0), 0.0
     if about["ground"] == "plain":

@@ -20,7 +20,10 @@ ABOUT = {"object", "task", "start", "ground", "seed", "fault", "look", "mark", "
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """What is known of one look; P = 625 material points, the centre of the top-left pixel is (0, 0)."""
+    """What is known of one look; P = 625 material points, the centre of the top-left pixel is (0, 0).
+
+    Of a film (`mmgsd.fold.jobs.film_job`) each array but ``first`` and the camera's has an axis of frames before.
+    """
 
     vertices: np.ndarray  # (V, 3) float32 m, world: of the simulated cloth, or of the rope's centre line
     points: np.ndarray  # (P, 3) float32 m

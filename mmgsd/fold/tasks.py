@@ -16,6 +16,8 @@ from mmgsd.checks import check_choice
 
 STARTS = {"cloth": ("flat", "wrinkled", "corner"), "rope": ("straight", "bent", "heavily bent")}
 GROUNDS = ("plain", "workspace")
+MOTIONS = ("fold", "turn", "gripper", "hand")  # of films: a task's moves, half a turn, moves under the grippers that
+# make them, half a turn with a hand that crosses the picture
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -35,6 +35,9 @@ from mmgsd.model.network import (
 from mmgsd.model.weights import read_weights
 from mmgsd.numerics import own_numerics
 from mmgsd.paths import find_shipped
+
+if TYPE_CHECKING:
+    from mmgsd.match.track import Track, Tracked
 
 QUARTERS = 4  # turns of an image whose descriptors are averaged: what noise they have differs
 SIZES_PX = (16, 65536)  # of the images that a model was taught with
@@ -265,6 +268,37 @@ class Matcher:
                              "given: python -m mmgsd calibrate adds them")  # fmt: skip
         return lay_flat(self.places.to(self.device), self.object, self.config.group)
 
+    def look_up_places(self, places: Any, *, joint: bool) -> tuple[Flat, np.ndarray, np.ndarray | None]:
+        """The object laid flat, the pixels (S, 2) of places there and how many like places (S,) each has.
+
+        ValueError is as of `find`.
+        """
+        learnt = isinstance(places, Place)
+        flat = lay_flat(places.descriptors, "", "") if learnt else self.lay_flat()
+        if joint and flat.object not in OBJECTS:
+            of = "pictures" if learnt else repr(flat.object)
+            raise ValueError(f"joint must be False for places of {of}: how they lie beside each other is not known")
+        return flat, *flat.look_up(list(range(len(places.descriptors))) if learnt else places)
+
+    def track(self, frames: Any, xy: Any = None, *, find: Any = None, mask0: Any = None) -> Track:
+        """Where pixels ``xy`` (S, 2) of the first of the ``frames`` are in all of them, each as itself.
+
+        Of its like matches a pixel's own one is chosen once and kept, while the object is turned, folded and hidden.
+        ``frames`` are images of one size that `match` takes, one after the other, or the path of a video or of a folder
+        of images. Instead of ``xy``, ``find`` names places as `find` takes them: all like ones are followed. ``mask0``
+        is as `match` has it. ValueError for frames of several sizes, none, or a first one without the object, for
+        ``xy`` outside it, and as ``joint`` has it.
+        """
+        from mmgsd.match.track import Track
+
+        return Track.collect(self.follow(frames, xy, find=find, mask0=mask0))
+
+    def follow(self, frames: Any, xy: Any = None, *, find: Any = None, mask0: Any = None) -> Iterator[Tracked]:
+        """As `track`, each frame's answer when it is asked for, so in little memory: for cameras and long videos."""
+        from mmgsd.match.track import follow
+
+        return follow(self, frames, xy, find=find, mask0=mask0)
+
     def match_many(
         self, questions: Iterable[tuple[Any, ...]], *, n: Any = None, joint: bool = False
     ) -> Iterator[Match]:
@@ -346,21 +380,24 @@ class Pair:
         if not joint:
             return self._match(points, n)
         count = check_answers(self.matcher.modes if n is None else n, self.matcher.modes)
+        match, order = self.match_everywhere(points)
+        weights = np.take_along_axis(match.weights, order, 1)
+        heavy = weights[len(points) if len(match) > len(points) else 0 :].sum(0) + 1e-9
+        return sort_modes(match[: len(points)], order[: len(points), :count], heavy[:count])
+
+    @own_numerics()
+    def match_everywhere(self, points: np.ndarray) -> tuple[Match, np.ndarray]:
+        """The answer to pixels (S, 2) of image0, then to places all over the object, and whose modes are whose.
+
+        That is an order (S + P, n) of each one's modes: its columns are members of the symmetry (`join`).
+        """
         mask = self._find_mask()
         places = spread_places(mask)
         match = self._match(np.concatenate([points, places.astype(points.dtype)]), None, merge=False)
-        order = join(match.xy, mask, match.modes, match.weights, match.spread_px, places=len(places))
-        weights = np.take_along_axis(match.weights, order, 1)
-        heavy = weights[len(points) if len(places) else 0 :].sum(0) + 1e-9
-        return sort_modes(match[: len(points)], order[: len(points), :count], heavy[:count])
+        return match, join(match.xy, mask, match.modes, match.weights, match.spread_px, places=len(places))
 
     def _find(self, places: Any, n: Any, joint: bool) -> Match:
-        learnt = isinstance(places, Place)
-        flat = lay_flat(places.descriptors, "", "") if learnt else self.matcher.lay_flat()
-        if joint and flat.object not in OBJECTS:
-            of = "pictures" if learnt else repr(flat.object)
-            raise ValueError(f"joint must be False for places of {of}: how they lie beside each other is not known")
-        xy, counts = flat.look_up(list(range(len(places.descriptors))) if learnt else places)
+        flat, xy, counts = self.matcher.look_up_places(places, joint=joint)
         asked = dataclasses.replace(self, image0=flat.image, said=(flat.outputs, self.said[1]), mask0=flat.mask)
         return asked.match(xy, n=counts if n is None and not joint else n, joint=joint)
 

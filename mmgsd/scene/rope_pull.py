@@ -25,10 +25,14 @@ LYING = 0.25  # how readily a particle on the table moves, of one in the air
 LOW = 0.75  # diameters: a particle below lies on the table
 
 
-def pull_rope(centre: np.ndarray, thickness: float, grasps: Sequence[tuple[int, np.ndarray]]) -> np.ndarray:
+def pull_rope(
+    centre: np.ndarray, thickness: float, grasps: Sequence[tuple[int, np.ndarray]], *,
+    watched: list[np.ndarray] | None = None,
+) -> np.ndarray:  # fmt: skip
     """The centre line (N, 3) m after its points ``grasps``, as (index, shift (2,) m), were carried at once.
 
-    ``thickness`` is the rope's diameter (m). No grasp leaves the rope to settle. ValueError for an index of no point.
+    ``thickness`` is the rope's diameter (m). No grasp leaves the rope to settle. Centre lines on the way are added to
+    ``watched``, where that is given. ValueError for an index of no point.
     """
     count = round(LENGTH / thickness / STEP) + 1
     for index, _ in grasps:
@@ -40,6 +44,8 @@ def pull_rope(centre: np.ndarray, thickness: float, grasps: Sequence[tuple[int, 
     chain = _Chain(points, held)
     for targets in _carry(points[held], shifts):
         chain.move(targets, ROUNDS)
+        if watched is not None:
+            watched.append(resample(chain.points * thickness, len(centre)))
     chain.let_go()
     chain.move(np.empty((0, 3)), SETTLE_ROUNDS)
     settled = chain.points * thickness

@@ -311,12 +311,13 @@ MOVES: dict[str, tuple[tuple[Plan, ...], ...]] = {
 
 
 def simulate(
-    planar: PlanarObject, vertices: np.ndarray, grasps: list[Grasp], frames: int, *, friction: float = FRICTION
-) -> np.ndarray:
+    planar: PlanarObject, vertices: np.ndarray, grasps: list[Grasp], frames: int, *, friction: float = FRICTION,
+    watched: list[np.ndarray] | None = None,
+) -> np.ndarray:  # fmt: skip
     """Run ``frames`` frames of cloth physics from ``vertices`` (V, 3) m at rest; the cloth remembers its flat shape.
 
     Grasped vertices follow their paths, which must be ``frames`` long; ``friction`` (0 to 80) is that of the floor.
-    Physics may return vertices that are not finite.
+    Physics may return vertices that are not finite. Those of each frame are added to ``watched``, where that is given.
     """
     scene = bpy.context.scene
     scene.frame_start, scene.frame_end = 1, frames
@@ -328,7 +329,10 @@ def simulate(
     _add_physics(cloth, [grasp.vertex for grasp in grasps], frames)
     for frame in range(1, frames + 1):
         scene.frame_set(frame)
-    result = read_vertices(cloth.evaluated_get(bpy.context.evaluated_depsgraph_get()).data)
+        if watched is not None or frame == frames:
+            result = read_vertices(cloth.evaluated_get(bpy.context.evaluated_depsgraph_get()).data)
+        if watched is not None:
+            watched.append(result)
     for thing in (cloth, floor, *hooks):
         bpy.data.objects.remove(thing)
     return result

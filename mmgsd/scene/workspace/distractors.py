@@ -182,6 +182,13 @@ def add_distractors(
     return remaining, names
 
 
+def add_occluder(rng: np.random.Generator, name: str, place: np.ndarray, *, lean: float, turn: float) -> None:
+    """Put one of `OCCLUDERS` with its lowest point over a place (3,) m, leaning (rad) from z, turned (rad) about it."""
+    parts = [(move(solid, turn, (0, 0, 0), lean=lean), *rest) for solid, *rest in OCCLUDERS[name](rng)]
+    low = min(solid.vertices[:, 2].min() for solid, *_ in parts)
+    _add(rng, _move(parts, 0.0, (*place[:2], place[2] - low)))
+
+
 def find_occluded(solids: list[Solid], points: np.ndarray, camera: Camera) -> np.ndarray:
     """Which points (P, 3) lie behind one of the solids, seen from the camera: (P,) bool."""
     covered, eye = np.zeros(len(points), dtype=bool), camera.pose[:3, 3]

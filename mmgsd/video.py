@@ -1,0 +1,115 @@
+"""The one place that reads and writes videos: files of OpenCV's kinds, animations, folders of images as their frames.
+
+OpenCV's wheels bring FFmpeg, so mp4, avi, mov, mkv and webm are read whatever their usual codec; GIF and animated WebP
+are Pillow's. FFmpeg in these wheels writes mp4 (MPEG-4), webm (VP8) and avi (Motion JPEG).
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from mmgsd.checks import check_choice
+from mmgsd.files import scratch_folder, writing
+from mmgsd.images import is_image, list_images, read_animation, read_image
+
+CODECS = {".mp4": "mp4v", ".webm": "VP80", ".avi": "MJPG"}  # of what is written
+RATE = 10.0  # frames a second, where nothing says it
+REMEDY = "save it as mp4 (H.264), for example by ffmpeg -i VIDEO video.mp4, or give a folder of its frames"
+
+
+@dataclass(frozen=True)
+class Video:
+    """Frames (H, W, 3) uint8 RGB, read when they are asked for, each time from the first one on."""
+
+    path: Path
+    count: int | None  # frames, None where the file does not say
+    rate: float = RATE  # frames a second
+
+    def __iter__(self) -> Iterator[np.ndarray]:
+        if self.path.is_dir():
+            return map(read_image, sort_naturally(list_images(self.path)))
+        return read_animation(self.path) if is_image(self.path) else _read_video(self.path)
+
+
+def open_video(path: Path | str) -> Video:
+    """A video, an animated GIF or WebP, or a folder of images in natural order (2 before 10).
+
+    FileNotFoundError where there is none; ValueError for a file that no decoder takes, a single image, and a folder
+    without images.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise FileNotFoundError(f"{path} does not exist: give the path of a video, or of a folder of images")
+    if path.is_dir():
+        return Video(path, len(list_images(path)))
+    if is_image(path):
+        return Video(path, sum(1 for _ in read_animation(path)))
+    with _opening(path) as capture:
+        if not capture.grab():
+            raise ValueError(f"{path} is no video, damaged, or of an unknown codec: {REMEDY}")
+        count, rate = (capture.get(key) for key in (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_FPS))
+    return Video(path, int(count) if 0 < count < 1e9 else None, rate if 0 < rate < 1e4 else RATE)
+
+
+def sort_naturally(paths: list[Path]) -> list[Path]:
+    """Paths by the numbers in their names: frame2 before frame10."""
+    return sorted(paths, key=lambda path: [(not p.isdecimal(), int(p) if p.isdecimal() else 0, p)
+                                           for p in re.split(r"(\d+)", path.name)])  # fmt: skip
+
+
+def _read_video(path: Path) -> Iterator[np.ndarray]:
+    with _opening(path) as capture:
+        while (read := capture.read())[0]:
+            yield cv2.cvtColor(read[1], cv2.COLOR_BGR2RGB)
+
+
+@contextmanager
+def _opening(path: Path) -> Iterator[cv2.VideoCapture]:
+    """What FFmpeg makes of a file; its own words are kept back, a sentence of ours says what is wrong."""
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    level = cv2.setLogLevel(0)
+    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    cv2.setLogLevel(level)
+    yield capture
+    capture.release()
+
+
+@contextmanager
+def writing_video(path: Path, rate: float) -> Iterator[Callable[[np.ndarray], None]]:
+    """Give what takes frames (H, W, 3) uint8 RGB of one size, ``rate`` a second; the file appears whole or not at all.
+
+    ValueError where its name does not end as `CODECS` do, RuntimeError where this OpenCV cannot write such a file.
+    """
+    check_choice("ending of a video that is written", path.suffix.lower(), tuple(CODECS))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with scratch_folder(path.parent, path.name) as folder:
+        inside, writers = folder / f"video{path.suffix.lower()}", []
+
+        def write(frame: np.ndarray) -> None:
+            if not writers:
+                writers.append(_open_writer(inside, rate, frame.shape[1::-1]))
+            writers[0].write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
+
+        try:
+            yield write
+        finally:
+            for writer in writers:
+                writer.release()
+        if writers:
+            with writing(path) as aside:
+                os.replace(inside, aside)
+
+
+def _open_writer(path: Path, rate: float, size: tuple[int, int]) -> cv2.VideoWriter:
+    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*CODECS[path.suffix]), rate, size)
+    if not writer.isOpened():
+        raise RuntimeError(f"this OpenCV cannot write {path.suffix} videos: choose another of {', '.join(CODECS)}")
+    return writer

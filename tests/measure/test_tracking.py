@@ -1,0 +1,65 @@
+"""Tracks are counted as TAP-Vid counts them, by hand-made ones of which the counts are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mmgsd.measure.tracking import Truth, average_tracks, measure_track
+
+SIZE = (512, 256)  # two px of a frame's width are one of the resized
+
+
+def make_truth(frames: int = 3, points: int = 4) -> Truth:
+    xy = np.zeros((frames, points, 2))
+    return Truth(xy, np.ones((frames, points), bool), xy[:, None] + (200, 0), SIZE)
+
+
+def test_a_perfect_track_has_all_points() -> None:
+    truth = make_truth()
+    measured = measure_track(truth.xy, truth.visible, truth)
+    assert (measured["delta"], measured["jaccard"], measured["occlusion"], measured["swaps"]) == (1, 1, 1, 0)
+
+
+def test_distances_are_of_the_resized_frame_and_thresholds_hold_their_border() -> None:
+    truth = make_truth()
+    xy = truth.xy + np.array([[8.0, 0], [8.1, 0], [0, 4], [0, 4.1]])  # 4, 4.05, 4 and 4.1 px resized
+    measured = measure_track(xy, truth.visible, truth)
+    assert [measured[f"delta@{t}px"] for t in (1, 2, 4, 8, 16)] == [0, 0, 0.5, 1, 1]
+    assert measured["delta"] == pytest.approx(0.5) and measured["jaccard"] == pytest.approx((2 / 6 + 2) / 5)
+
+
+def test_the_first_frame_and_hidden_points_do_not_count() -> None:
+    truth = make_truth()
+    truth.visible[:, 1] = False
+    xy = truth.xy.copy()
+    xy[0], xy[:, 1] = 500, 500
+    assert measure_track(xy, truth.visible, truth)["delta"] == 1
+    assert measure_track(xy, np.ones((3, 4), bool), truth)["occlusion"] == 0.75
+
+
+def test_a_point_that_takes_its_like_ones_place_is_swapped() -> None:
+    truth = make_truth()
+    xy = truth.xy.copy()
+    xy[1:, 0] += (101, 0)
+    xy[1, 1] += (99, 0)
+    xy[2, 2] = np.nan
+    measured = measure_track(xy, np.isfinite(xy).all(-1), truth)
+    assert measured["swaps"] == 2 / 8 and measured["delta@1px"] == 4 / 8
+
+
+def test_what_has_no_like_points_cannot_swap() -> None:
+    truth = make_truth()
+    alone = Truth(truth.xy, truth.visible, truth.likes[:, :0], SIZE)
+    assert measure_track(truth.xy + 100, truth.visible, alone)["swaps"] == 0
+
+
+def test_sequences_weigh_alike_and_what_one_has_not_does_not_count() -> None:
+    assert average_tracks([{"delta": 0.5}, {"delta": 1.0}, {"delta": float("nan")}]) == {"delta": 0.75}
+
+
+@pytest.mark.parametrize("frames", [1, 2])
+def test_other_shapes_are_refused(frames: int) -> None:
+    truth = make_truth(frames)
+    with pytest.raises(ValueError, match="xy must have the shape of the truth"):
+        measure_track(truth.xy[: frames - 1] if frames > 1 else truth.xy, truth.visible, truth)

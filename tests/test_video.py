@@ -1,0 +1,75 @@
+"""Videos are read frame by frame, whatever holds them, and written whole; what is none is said in one sentence."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mmgsd.video import CODECS, open_video, sort_naturally, writing_video
+
+SIZE = (48, 64)
+
+
+def make_frames(count: int = 5) -> list[np.ndarray]:
+    return [np.full((*SIZE, 3), (40 * k, 200 - 40 * k, 90), np.uint8) for k in range(count)]
+
+
+@pytest.mark.parametrize("ending", CODECS)
+def test_what_is_written_is_read_again(tmp_path: Path, ending: str) -> None:
+    path = tmp_path / "new" / f"a{ending}"
+    with writing_video(path, 12.5) as write:
+        for frame in make_frames():
+            write(frame)
+        assert not path.exists()
+    video = open_video(path)
+    assert (video.count, video.rate) == (5, 12.5) and list(path.parent.iterdir()) == [path]
+    for frame, expected in zip(video, make_frames(), strict=True):
+        assert np.abs(frame.astype(int) - expected).mean() < 6
+    assert len(list(video)) == 5  # once more from the first one on
+
+
+def test_what_fails_while_it_is_written_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(RuntimeError, match="stop"), writing_video(tmp_path / "a.avi", 10) as write:
+        write(make_frames()[0])
+        raise RuntimeError("stop")
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(ValueError, match=r"one of '.mp4', '.webm', '.avi'"), writing_video(tmp_path / "a.mkv", 10):
+        pass
+
+
+@pytest.mark.parametrize("ending", ["gif", "webp", "png"])
+def test_animations_are_videos(tmp_path: Path, ending: str) -> None:
+    images = [Image.fromarray(frame) for frame in make_frames()]
+    images[0].save(tmp_path / f"a.{ending}", save_all=True, append_images=images[1:], duration=100)
+    video = open_video(tmp_path / f"a.{ending}")
+    assert video.count == 5 and np.abs(list(video)[3].astype(int) - make_frames()[3]).mean() < 6
+
+
+def test_a_folder_is_read_in_natural_order(tmp_path: Path) -> None:
+    for number, frame in zip((10, 2, 1), make_frames(3), strict=True):
+        Image.fromarray(frame).save(tmp_path / f"frame{number}.png")
+    (tmp_path / "notes.txt").write_text("of the day")
+    video = open_video(tmp_path)
+    assert video.count == 3
+    for frame, expected in zip(video, make_frames(3)[::-1], strict=True):
+        np.testing.assert_array_equal(frame, expected)
+    names = ["b1", "a10b2", "a10b1", "a9", "a09", "a"]
+    assert [path.name for path in sort_naturally([Path(name) for name in names])] == [
+        "a", "a09", "a9", "a10b1", "a10b2", "b1"]  # fmt: skip
+
+
+def test_what_is_no_video_is_said(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="does not exist"):
+        open_video(tmp_path / "none.mp4")
+    with pytest.raises(ValueError, match="holds no image"):
+        open_video(tmp_path)
+    for name, data in (("a.mp4", b"no video" * 100), ("empty.avi", b""), ("cut.webm", b"\x1aE\xdf\xa3" * 9)):
+        (tmp_path / name).write_bytes(data)
+        with pytest.raises(ValueError, match=rf"{name} is no video, damaged, or of an unknown codec.*ffmpeg"):
+            open_video(tmp_path / name)
+    Image.fromarray(make_frames()[0]).save(tmp_path / "one.png")
+    with pytest.raises(ValueError, match="one.png is a single image"):
+        open_video(tmp_path / "one.png")
