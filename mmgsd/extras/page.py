@@ -44,6 +44,8 @@ RUNTIME = (  # of its package: for WebAssembly, and for WebGPU
     "ort.wasm.min.mjs", "ort-wasm-simd-threaded.mjs", "ort-wasm-simd-threaded.wasm",
     "ort.webgpu.min.mjs", "ort-wasm-simd-threaded.asyncify.mjs", "ort-wasm-simd-threaded.asyncify.wasm",
 )  # fmt: skip
+CHECK_FACTOR, CHECK_MODULUS, CHECK_STEP = 7919, 1009, 97  # of the picture's values, and of the descriptors compared
+CHECK_TOLERANCE = 0.02  # of the largest descriptor's value; a GPU may compute in another order
 LICENCES = ("LICENSE", "ThirdPartyNotices.txt")  # which the npm package lacks and the same runtime for Python has
 OURS = {*AS_THEY_ARE, "page.js", "page.css", "worker.js", "model.json", "model.onnx", "ort", "samples"}
 
@@ -67,8 +69,8 @@ def make_page(matcher: Matcher, out: Path | str, *, name: str, runtime: Path | s
             export_onnx(matcher, folder / "model.onnx", half=True)
         except RuntimeError:
             export_onnx(matcher, folder / "model.onnx")
-        write_json(folder / "model.json", describe_model(matcher, name) | {"samples": _copy_samples(matcher, folder)},
-                   indent=None)  # fmt: skip
+        known = describe_model(matcher, name) | {"check": _make_check(folder / "model.onnx", matcher.least_px)}
+        write_json(folder / "model.json", known | {"samples": _copy_samples(matcher, folder)}, indent=None)
         for file in AS_THEY_ARE:
             shutil.copy(HERE / "page" / file, folder / file)
         write_text(folder / "page.js", _join(SCRIPTS))
@@ -95,6 +97,16 @@ def describe_model(matcher: Matcher, name: str) -> dict[str, Any]:
         table = [distance for distance in calibration.radius if math.isfinite(distance)]
         known["calibration"] = {"levels": LEVELS[: len(table)], "table": table, "powers": calibration.powers}
     return known
+
+
+def _make_check(network: Path, least: int) -> dict[str, Any]:
+    """Some descriptors of a made-up picture, by which a browser finds out whether its GPU computes what it should."""
+    numbers = np.arange(3 * least**2) * CHECK_FACTOR % CHECK_MODULUS / CHECK_MODULUS
+    session = onnxruntime.InferenceSession(network, providers=["CPUExecutionProvider"])
+    (found, *_) = session.run(None, {"image": numbers.astype(np.float32).reshape(1, 3, least, least)})
+    values = found.ravel()[::CHECK_STEP]
+    return {"factor": CHECK_FACTOR, "modulus": CHECK_MODULUS, "step": CHECK_STEP, "values": values.tolist(),
+            "tolerance": CHECK_TOLERANCE * float(np.abs(found).max())}  # fmt: skip
 
 
 def describe_mixture(reading: mixture.Reading) -> dict[str, Any]:

@@ -225,6 +225,21 @@ def test_a_tap_has_the_librarys_answer_online_and_offline(
 
 
 @in_browser
+def test_a_runtime_that_computes_something_else_is_not_believed(whole: Path, chromium: Any, tmp_path: Path) -> None:
+    for path in whole.iterdir():
+        (tmp_path / path.name).symlink_to(path)
+    model = json.loads((whole / "model.json").read_text())
+    model["check"]["values"][7] += 2 * model["check"]["tolerance"]
+    (tmp_path / "model.json").unlink()
+    (tmp_path / "model.json").write_text(json.dumps(model))
+    page = chromium.context.browser.new_page()
+    with serve(tmp_path) as address:
+        page.goto(address, timeout=PATIENCE_MS)
+        page.get_by_text("it computes other descriptors").wait_for(timeout=PATIENCE_MS)
+    page.close()
+
+
+@in_browser
 def test_what_is_no_picture_is_refused_in_words_and_a_pasted_one_is_opened(whole: Path, chromium: Any, tmp_path: Path) -> None:
     page = chromium.context.browser.new_page()
     (tmp_path / "photo.heic").write_bytes(b"\0\0\0\x18ftypheic")

@@ -131,13 +131,15 @@ class Page {
 
   async openSession() {
     const adapter = await navigator.gpu?.requestAdapter().catch(() => null);
-    for (const [name, [provider, script]] of Object.entries(RUNTIMES).slice(adapter ? 0 : 1)) {
+    const fast = adapter && !(adapter.info?.isFallbackAdapter ?? adapter.isFallbackAdapter); // one in software is slower
+    for (const [name, [provider, script]] of Object.entries(RUNTIMES).slice(fast ? 0 : 1)) {
       try {
         this.say(`Loading the network for ${name}, once: then it works offline.`);
         const ort = await import(`./ort/${script}`);
         ort.env.wasm.wasmPaths = new URL("ort/", document.baseURI).href;
         const session = await ort.InferenceSession.create("model.onnx", { executionProviders: [provider] });
         [this.runtime, this.Tensor] = [name, ort.Tensor];
+        await this.check(session);
         return session;
       } catch (error) {
         if (name === "WebAssembly") throw error;
@@ -146,12 +148,22 @@ class Page {
     }
   }
 
+  async check(session) { // against what the library's own runtime has for a made-up picture
+    const { check: { factor, modulus, step, values, tolerance }, least_px: side } = this.model;
+    const pixels = Float32Array.from({ length: 3 * side ** 2 }, (_, k) => ((k * factor) % modulus) / modulus);
+    const { descriptors: { data } } = await this.run(session, pixels, [side, side]);
+    if (!values.every((value, k) => Math.abs(data[k * step] - value) <= tolerance)) throw new Error("it computes other descriptors");
+  }
+
+  run(session, pixels, [width, height]) {
+    return session.run({ image: new this.Tensor("float32", pixels, [1, 3, height, width]) });
+  }
+
   async describe(image) {
     this.say("Looking at the pictures.");
     await new Promise((resolve) => setTimeout(resolve)); // the words are drawn
     const size = fitInputSize(image.size, this.model);
-    const input = new this.Tensor("float32", resize(image.pixels, image.size, size), [1, 3, size[1], size[0]]);
-    const found = await this.session.run({ image: input });
+    const found = await this.run(this.session, resize(image.pixels, image.size, size), size);
     const plane = ([name, { data, dims }]) => [name, { data, shape: dims.length === 4 ? dims.slice(1) : dims }];
     return Object.fromEntries(Object.entries(found).map(plane));
   }
