@@ -1,12 +1,13 @@
 """How Sphinx makes the site of `make docs`: its sources are the repository's own pages, found from its root."""
 
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 project, author, html_title = "mmgsd", "the authors of mmgsd", "mmgsd"
 extensions = ["myst_parser", "sphinx.ext.autodoc"]
 root_doc = "README"
-include_patterns = ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", "docs/*.md", "data/results/*.md", "data/weights/*.md"]
+include_patterns = ["*.md", *(f"{folder}/*.md" for folder in ("docs", "data/results", "data/weights"))]
 html_theme, html_extra_path, html_copy_source = "furo", ["index.html"], False
 
 myst_heading_anchors = 6  # GitHub's
@@ -32,12 +33,12 @@ PAGES = {
 }
 
 
-def setup(app):
+def setup(app: Any) -> None:
     """Give the first page, which GitHub shows as well, its table of contents."""
     app.connect("source-read", add_contents)
 
 
-def add_contents(app, name, source):
+def add_contents(app: Any, name: str, source: list[str]) -> None:
     """Sphinx's hook: a page's source, as it is read."""
     if name == root_doc:
         source[0] += "".join(CONTENTS % (caption, "\n".join(pages)) for caption, pages in PAGES.items())

@@ -68,8 +68,10 @@ def _list_commands() -> Iterator[tuple[str, str]]:
 def _sign(thing: Any) -> str:
     """The parameters, without what their docstring says of them."""
     signature = inspect.signature(thing)
-    known = [one.replace(annotation=one.empty) for one in signature.parameters.values() if one.name not in ("self", "cls")]
-    return str(signature.replace(parameters=known, return_annotation=signature.empty))
+    given = [one for name, one in signature.parameters.items() if name not in ("self", "cls")]
+    known = [one.replace(annotation=one.empty) for one in given]
+    text = str(signature.replace(parameters=known, return_annotation=signature.empty))
+    return re.sub(r"=<.*? at 0x[0-9a-f]+>", "=…", text)  # of a function, which has another address each time
 
 
 def _to_markdown(thing: Any) -> str:

@@ -24,8 +24,8 @@ import onnxruntime
 
 from mmgsd.config import OBJECTS
 from mmgsd.extras.exporting import export_onnx
-from mmgsd.files import check_ours, read_json, replace_folder, scratch_folder, write_json, write_text
 from mmgsd.figures.style import HEAT
+from mmgsd.files import check_ours, read_json, replace_folder, scratch_folder, write_json, write_text
 from mmgsd.match import mixture
 from mmgsd.match.match import LIKELY, RADIUS_PX
 from mmgsd.match.matcher import Matcher

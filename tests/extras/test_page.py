@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -102,7 +103,9 @@ def test_a_page_takes_the_place_of_another_and_of_nothing_else(hollow: Path, mat
     assert {path: path.read_bytes() for path in sorted(hollow.rglob("*")) if path.is_file()} == before
 
 
-def test_another_runtime_and_none_are_refused(matcher: Matcher, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_runtime_and_none_are_refused(
+    matcher: Matcher, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "package" / "dist").mkdir(parents=True)
     with pytest.raises(ValueError, match="runtime.*ort.wasm.min.mjs"):
         make_page(matcher, tmp_path / "page", name="cloth", runtime=tmp_path / "package")
@@ -126,7 +129,8 @@ def test_the_mixture_is_the_librarys_on_200_questions(
     pair = matcher.prepare(*map(mmgsd.read_image, find_samples("cloth")))
     heats = torch.from_numpy(pair.match(rng.uniform(60, 420, (200, 2))).cells)
     rows, columns = heats.shape[1:]
-    expected = fit_modes(heats, 4, torch.arange(columns).float(), torch.arange(rows).float(), reading=reading, merge=True)
+    xs, ys = (torch.arange(count, dtype=torch.float32) for count in (columns, rows))
+    expected = fit_modes(heats, 4, xs, ys, reading=reading, merge=True)
     asked = [heats.flatten(1).double().tolist(), [rows, columns], 4, describe_mixture(reading)]
     with serve(hollow) as address:
         chromium.goto(f"{address}/model.json")
@@ -146,9 +150,9 @@ def test_the_mixture_is_the_librarys_on_200_questions(
 
 @in_browser
 @pytest.mark.parametrize("size", [(256, 256), (97, 256), (300, 310)], ids=str)
-def test_pictures_are_resized_as_the_library_does(hollow: Path, chromium: Any, rng: np.random.Generator, size: Any) -> None:
-    import cv2
-
+def test_pictures_are_resized_as_the_library_does(
+    hollow: Path, chromium: Any, rng: np.random.Generator, size: tuple[int, int]
+) -> None:
     image = rng.integers(0, 256, (201, 300, 4), dtype=np.uint8)
     with serve(hollow) as address:
         chromium.goto(f"{address}/model.json")
@@ -240,7 +244,7 @@ def test_a_runtime_that_computes_something_else_is_not_believed(whole: Path, chr
 
 
 @in_browser
-def test_what_is_no_picture_is_refused_in_words_and_a_pasted_one_is_opened(whole: Path, chromium: Any, tmp_path: Path) -> None:
+def test_what_is_no_picture_is_refused_and_a_pasted_one_is_opened(whole: Path, chromium: Any, tmp_path: Path) -> None:
     page = chromium.context.browser.new_page()
     (tmp_path / "photo.heic").write_bytes(b"\0\0\0\x18ftypheic")
     with serve(whole) as address:
