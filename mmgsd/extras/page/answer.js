@@ -39,14 +39,18 @@ export function resize(pixels, [width, height], [toWidth, toHeight]) {
   return out;
 }
 
-function listTaps(count, wanted, smaller) { // [from, share] of each of the wanted columns, or rows
+function listTaps(count, wanted, smaller) {
+  // [from, share] of each of the wanted columns, or rows
   const scale = count / wanted;
   return Array.from({ length: wanted }, (_, to) => {
     if (!smaller) {
       const from = Math.floor(to * scale);
       const beyond = to + 1 - (from + 1) / scale;
       const share = beyond <= 0 ? 0 : beyond - Math.floor(beyond);
-      return [[Math.min(from, count - 1), 1 - share], [Math.min(from + 1, count - 1), share]];
+      return [
+        [Math.min(from, count - 1), 1 - share],
+        [Math.min(from + 1, count - 1), share],
+      ];
     }
     const [start, end, taps] = [to * scale, Math.min((to + 1) * scale, count), []];
     for (let from = Math.floor(start); from < end - 1e-6; from++) {
@@ -58,7 +62,8 @@ function listTaps(count, wanted, smaller) { // [from, share] of each of the want
 
 // ---- planes
 
-function sample({ data, shape: [channels, rows, columns] }, [x, y], size) { // bilinear
+function sample({ data, shape: [channels, rows, columns] }, [x, y], size) {
+  // bilinear
   const at = [((x + 0.5) * columns) / size[0] - 0.5, ((y + 0.5) * rows) / size[1] - 0.5];
   const [u, v] = [clamp(at[0], 0, columns - 1), clamp(at[1], 0, rows - 1)];
   const [left, top] = [Math.min(Math.floor(u), columns - 2), Math.min(Math.floor(v), rows - 2)];
@@ -70,22 +75,31 @@ function sample({ data, shape: [channels, rows, columns] }, [x, y], size) { // b
   });
 }
 
-function pool({ data, shape: [, rows, columns] }, [toRows, toColumns], bounds) { // the most of the cells within bounds
-  const [down, across] = [[toRows, rows], [toColumns, columns]].map(([to, from]) => Array.from({ length: to }, (_, k) => bounds(k, to, from)));
+function pool({ data, shape: [, rows, columns] }, [toRows, toColumns], bounds) {
+  // the most of the cells within bounds
+  const [down, across] = [
+    [toRows, rows],
+    [toColumns, columns],
+  ].map(([to, from]) => Array.from({ length: to }, (_, k) => bounds(k, to, from)));
   const pooled = Float64Array.from({ length: toRows * toColumns }, (_, k) => {
     const [[top, bottom], [left, right]] = [down[Math.floor(k / toColumns)], across[k % toColumns]];
     let most = -Infinity;
-    for (let row = top; row < bottom; row++) for (let column = left; column < right; column++) most = Math.max(most, data[row * columns + column]);
+    for (let row = top; row < bottom; row++)
+      for (let column = left; column < right; column++) most = Math.max(most, data[row * columns + column]);
     return most;
   });
   return { data: pooled, shape: [1, toRows, toColumns] };
 }
 
-const shrink = (plane, shape) => pool(plane, shape, (k, to, from) => [Math.floor((k * from) / to), Math.ceil(((k + 1) * from) / to)]);
-const widen = (plane, reach) => pool(plane, plane.shape.slice(1), (k, _, from) => [Math.max(k - reach, 0), Math.min(k + reach + 1, from)]);
+const shrink = (plane, shape) =>
+  pool(plane, shape, (k, to, from) => [Math.floor((k * from) / to), Math.ceil(((k + 1) * from) / to)]);
+const widen = (plane, reach) =>
+  pool(plane, plane.shape.slice(1), (k, _, from) => [Math.max(k - reach, 0), Math.min(k + reach + 1, from)]);
 const see = ({ data, shape }) => ({ data: Float64Array.from(data, sigmoid), shape });
-const part = ({ data, shape: [, rows, columns] }, start, count) =>
-  ({ data: data.subarray(start * rows * columns, (start + count) * rows * columns), shape: [count, rows, columns] });
+const part = ({ data, shape: [, rows, columns] }, start, count) => ({
+  data: data.subarray(start * rows * columns, (start + count) * rows * columns),
+  shape: [count, rows, columns],
+});
 
 // ---- answers
 
@@ -119,7 +133,8 @@ export function match(image0, image1, xy, model) {
   const { state, outside } = fitModes(heat, [rows, columns], model.modes, model.mixture);
   const cell = [image1.size[0] / columns, image1.size[1] / rows];
   const scale = Math.sqrt((image1.size[0] * image1.size[1]) / (model.size[0] * model.size[1]));
-  const nats = heat.reduce((total, p) => total - (p > 0 ? p * Math.log(p) : 0), Math.log(cell[0] * cell[1])) - 2 * Math.log(scale);
+  const nats =
+    heat.reduce((total, p) => total - (p > 0 ? p * Math.log(p) : 0), Math.log(cell[0] * cell[1])) - 2 * Math.log(scale);
   const known = lookUp(image0, image1, xy, model);
   const shown = (known.on_object ?? 1) * (1 - (known.absent ?? 0));
   const modes = state.map(([x, y, weight, a, b, c]) => {
@@ -143,18 +158,36 @@ function lookUp(image0, image1, xy, model) {
   const [onObject] = sample(widen(shrink(see(mask), coarse), reach), xy, image0.size);
   const absent = 1 - sigmoid(present.data[0]);
   const share = (value) => `${Math.round(100 * value)} % sure`;
-  const said = absent > model.likely ? `The right image does not show the object (${share(absent)}).`
-    : onObject < model.likely ? `The pixel is not on the object (${share(1 - onObject)}).` : "";
+  const said =
+    absent > model.likely
+      ? `The right image does not show the object (${share(absent)}).`
+      : onObject < model.likely
+        ? `The pixel is not on the object (${share(1 - onObject)}).`
+        : "";
   return { on_object: onObject, absent, said };
 }
 
 function computeVisible(source, { outputs, size }, place, model) {
   const there = sample(outputs.descriptors, place, size);
-  const roles = Array.from({ length: there.length / model.dim }, (_, role) => source.map((value, k) => value - there[role * model.dim + k]));
-  const near = roles.map((apart) => Math.min(apart.reduce((total, value) => total + value ** 2, 0), 50) / 10);
-  const layer = ([weights, biases], x) => weights.map((row, k) => row.reduce((total, w, i) => total + w * x[i], biases[k]));
+  const roles = Array.from({ length: there.length / model.dim }, (_, role) =>
+    source.map((value, k) => value - there[role * model.dim + k]),
+  );
+  const near = roles.map(
+    (apart) =>
+      Math.min(
+        apart.reduce((total, value) => total + value ** 2, 0),
+        50,
+      ) / 10,
+  );
+  const layer = ([weights, biases], x) =>
+    weights.map((row, k) => row.reduce((total, w, i) => total + w * x[i], biases[k]));
   const hidden = layer(model.judge[0], [...roles.flat(), ...near, ...sample(outputs.surface, place, size)]);
-  return sigmoid(layer(model.judge[1], hidden.map((value) => Math.max(value, 0)))[0]);
+  return sigmoid(
+    layer(
+      model.judge[1],
+      hidden.map((value) => Math.max(value, 0)),
+    )[0],
+  );
 }
 
 function computeConfidence([spread, share, extent], { calibration, radius_px: radius }) {
@@ -167,7 +200,14 @@ function computeConfidence([spread, share, extent], { calibration, radius_px: ra
   return low + ((levels[next] - low) * (at - from)) / (table[next] - from);
 }
 
-function computeEllipse([x, y], [a, b, c]) { // of 1 std, its angle that of the longer axis
+function computeEllipse([x, y], [a, b, c]) {
+  // of 1 std, its angle that of the longer axis
   const [middle, reach] = [(a + c) / 2, Math.hypot((a - c) / 2, b)];
-  return { x, y, major: Math.sqrt(middle + reach), minor: Math.sqrt(Math.max(middle - reach, 0)), angle: Math.atan2(2 * b, a - c) / 2 };
+  return {
+    x,
+    y,
+    major: Math.sqrt(middle + reach),
+    minor: Math.sqrt(Math.max(middle - reach, 0)),
+    angle: Math.atan2(2 * b, a - c) / 2,
+  };
 }

@@ -7,12 +7,20 @@ const sum = (values) => values.reduce((total, value) => total + value, 0);
 export function fitModes(heat, [rows, columns], n, how) {
   const total = sum(heat);
   const even = 1 / (rows * columns);
-  const mass = interpolate(Float64Array.from(heat, (value) => (total > 0 ? value / total : even)), rows, columns, how);
+  const mass = interpolate(
+    Float64Array.from(heat, (value) => (total > 0 ? value / total : even)),
+    rows,
+    columns,
+    how,
+  );
   const cells = describeCells(rows, columns);
   let state = fit(raise(mass, how.power), cells, n, how);
   if (how.power !== 1 || how.sharpness !== 1) state = measureShares(mass, state, cells, how);
   state = merge(state);
-  return { state: state.filter(([, , weight]) => weight > 0).sort((p, q) => q[2] - p[2]), outside: measureOutside(mass, state, cells, how) };
+  return {
+    state: state.filter(([, , weight]) => weight > 0).sort((p, q) => q[2] - p[2]),
+    outside: measureOutside(mass, state, cells, how),
+  };
 }
 
 function describeCells(rows, columns) {
@@ -24,11 +32,13 @@ function describeCells(rows, columns) {
   return { x, y, rows, columns };
 }
 
-function interpolate(mass, rows, columns, { spread }) { // what a bilinear resize to pixels does to the moments
+function interpolate(mass, rows, columns, { spread }) {
+  // what a bilinear resize to pixels does to the moments
   const along = (values, count, step, start) => {
     const line = Array.from({ length: count }, (_, k) => values[start + k * step]);
     line.forEach((value, k) => {
-      values[start + k * step] = spread[0] * line[Math.max(k - 1, 0)] + spread[1] * value + spread[2] * line[Math.min(k + 1, count - 1)];
+      values[start + k * step] =
+        spread[0] * line[Math.max(k - 1, 0)] + spread[1] * value + spread[2] * line[Math.min(k + 1, count - 1)];
     });
   };
   for (let row = 0; row < rows; row++) along(mass, columns, 1, row * columns);
@@ -44,7 +54,8 @@ function raise(mass, power) {
   return raised.map((value) => value / total);
 }
 
-function fit(mass, cells, n, how) { // where a component collapsed, the likelier of that and one from the peaks
+function fit(mass, cells, n, how) {
+  // where a component collapsed, the likelier of that and one from the peaks
   const state = fitFrom(how.annealing, mass, cells, n, how);
   if (!state.some(([, , weight]) => weight > 0 && weight * n < how.collapsed)) return state;
   const again = fitFrom([], mass, cells, n, how);
@@ -56,68 +67,103 @@ function fitFrom(temperatures, mass, cells, n, how) {
   const { rows, columns } = cells;
   const [h, w] = [Math.ceil(rows / 2), Math.ceil(columns / 2)];
   const coarse = new Float64Array(h * w);
-  mass.forEach((value, k) => { coarse[(Math.floor(k / columns) >> 1) * w + ((k % columns) >> 1)] += value; });
+  mass.forEach((value, k) => {
+    coarse[(Math.floor(k / columns) >> 1) * w + ((k % columns) >> 1)] += value;
+  });
   const halved = describeCells(h, w);
   let state = findPeaks(coarse, h, w, n, how);
   for (const temperature of temperatures) {
     const flat = coarse.map((value) => value ** (1 / temperature));
     const total = sum(flat);
-    flat.forEach((value, k) => { flat[k] = value / total; });
+    flat.forEach((value, k) => {
+      flat[k] = value / total;
+    });
     for (let k = 0; k < how.annealing_cycles; k++) state = runCycle(flat, state, halved, how);
   }
-  state = state.map(([x, y, weight, a, b, c]) => [2 * x + 0.5 * (columns % 2), 2 * y + 0.5 * (rows % 2), weight, 4 * a, 4 * b, 4 * c]);
+  state = state.map(([x, y, weight, a, b, c]) => [
+    2 * x + 0.5 * (columns % 2),
+    2 * y + 0.5 * (rows % 2),
+    weight,
+    4 * a,
+    4 * b,
+    4 * c,
+  ]);
   for (let k = 0; k < how.cycles; k++) {
     const after = runCycle(mass, state, cells, how);
-    const moved = Math.max(...after.map((one, i) => Math.max(Math.abs(one[0] - state[i][0]), Math.abs(one[1] - state[i][1]))));
+    const moved = Math.max(
+      ...after.map((one, i) => Math.max(Math.abs(one[0] - state[i][0]), Math.abs(one[1] - state[i][1]))),
+    );
     state = after;
     if (moved <= how.tolerance) break;
   }
   return computeMoments(mass, state, cells, how).map((one) => one.with(2, Math.max(one[2], 1e-9)));
 }
 
-function findPeaks(mass, rows, columns, n, { kernel }) { // one after another, each taking the mass around it away
+function findPeaks(mass, rows, columns, n, { kernel }) {
+  // one after another, each taking the mass around it away
   const bell = (distance) => Math.exp(-0.5 * (distance / kernel) ** 2);
   const rest = mass.slice();
   return Array.from({ length: n }, () => {
     const wide = new Float64Array(rest.length);
     const local = new Float64Array(rest.length);
-    for (let row = 0; row < rows; row++) for (let to = 0; to < columns; to++) for (let from = 0; from < columns; from++) {
-      wide[row * columns + to] += rest[row * columns + from] * bell(to - from);
-    }
-    for (let to = 0; to < rows; to++) for (let from = 0; from < rows; from++) for (let column = 0; column < columns; column++) {
-      local[to * columns + column] += wide[from * columns + column] * bell(to - from);
-    }
+    for (let row = 0; row < rows; row++)
+      for (let to = 0; to < columns; to++)
+        for (let from = 0; from < columns; from++) {
+          wide[row * columns + to] += rest[row * columns + from] * bell(to - from);
+        }
+    for (let to = 0; to < rows; to++)
+      for (let from = 0; from < rows; from++)
+        for (let column = 0; column < columns; column++) {
+          local[to * columns + column] += wide[from * columns + column] * bell(to - from);
+        }
     const score = local.map((value, k) => value * (rest[k] + 1e-3 * value));
     const peak = score.indexOf(score.reduce((a, b) => Math.max(a, b)));
     const [row, column] = [Math.floor(peak / columns), peak % columns];
-    rest.forEach((value, k) => { rest[k] = value * (1 - bell(Math.floor(k / columns) - row) * bell((k % columns) - column)); });
+    rest.forEach((value, k) => {
+      rest[k] = value * (1 - bell(Math.floor(k / columns) - row) * bell((k % columns) - column));
+    });
     return [column - (columns - 1) / 2, row - (rows - 1) / 2, 1 / n, kernel ** 2, 0, kernel ** 2];
   });
 }
 
-function runCycle(mass, state, cells, how) { // two steps of expectation-maximisation, a leap, a step (SQUAREM)
+function runCycle(mass, state, cells, how) {
+  // two steps of expectation-maximisation, a leap, a step (SQUAREM)
   const first = step(mass, state, cells, how);
   const second = step(mass, first, cells, how);
   const [pace, change] = [[], []];
-  state.forEach((one, i) => one.forEach((value, k) => {
-    pace.push(first[i][k] - value);
-    change.push(second[i][k] - 2 * first[i][k] + value);
-  }));
+  state.forEach((one, i) =>
+    one.forEach((value, k) => {
+      pace.push(first[i][k] - value);
+      change.push(second[i][k] - 2 * first[i][k] + value);
+    }),
+  );
   const length = Math.min(Math.max(Math.hypot(...pace) / Math.max(Math.hypot(...change), 1e-12), 1), how.leap);
-  const leapt = state.map((one, i) => one.map((value, k) => value + 2 * length * pace[6 * i + k] + length ** 2 * change[6 * i + k]));
+  const leapt = state.map((one, i) =>
+    one.map((value, k) => value + 2 * length * pace[6 * i + k] + length ** 2 * change[6 * i + k]),
+  );
   const least = how.min_variance;
-  const lawful = leapt.every(([, , weight, a, b, c]) => a > least && c > least && a * c - b * b > least ** 2 && weight >= 0);
+  const lawful = leapt.every(
+    ([, , weight, a, b, c]) => a > least && c > least && a * c - b * b > least ** 2 && weight >= 0,
+  );
   return step(mass, lawful ? leapt : second, cells, how);
 }
 
-function step(mass, state, cells, how) { // with the priors
+function step(mass, state, cells, how) {
+  // with the priors
   const found = computeMoments(mass, state, cells, how);
-  const width = sum(found.map(([, , weight, a, , c]) => 0.5 * weight * (a + c))) / sum(found.map(([, , weight]) => weight));
+  const width =
+    sum(found.map(([, , weight, a, , c]) => 0.5 * weight * (a + c))) / sum(found.map(([, , weight]) => weight));
   const present = found.map(([, , weight], k) => (state[k][2] > 0 ? weight + how.prior_weight : 0));
   const total = sum(present);
   const blend = (weight, value, prior) => (weight * value + how.roundness * prior) / (weight + how.roundness);
-  return found.map(([x, y, weight, a, b, c], k) =>
-    [x, y, present[k] / total, blend(weight, a, width), blend(weight, b, 0), blend(weight, c, width)]);
+  return found.map(([x, y, weight, a, b, c], k) => [
+    x,
+    y,
+    present[k] / total,
+    blend(weight, a, width),
+    blend(weight, b, 0),
+    blend(weight, c, width),
+  ]);
 }
 
 // Calls `take(cell, shares)` with each component's share of each cell's mass.
@@ -126,14 +172,17 @@ function share(mass, state, { x, y }, take) {
   const shares = new Float64Array(state.length);
   for (let k = 0; k < mass.length; k++) {
     let [most, total] = [-Infinity, 0];
-    lines.forEach((line, i) => { most = Math.max(most, shares[i] = computeLogDensity(line, x[k], y[k])); });
+    lines.forEach((line, i) => {
+      most = Math.max(most, (shares[i] = computeLogDensity(line, x[k], y[k])));
+    });
     for (let i = 0; i < shares.length; i++) total += shares[i] = Math.exp(shares[i] - most);
     for (let i = 0; i < shares.length; i++) shares[i] *= mass[k] / total;
     take(k, shares);
   }
 }
 
-function describeLogDensity([x, y, weight, a, b, c]) { // coefficients of 1, x, y, x², xy, y², less the constant ln 2π
+function describeLogDensity([x, y, weight, a, b, c]) {
+  // coefficients of 1, x, y, x², xy, y², less the constant ln 2π
   const determinant = a * c - b * b;
   const [p, q, r] = [c / determinant, -b / determinant, a / determinant];
   const origin = Math.log(weight) - 0.5 * Math.log(determinant) - 0.5 * (p * x * x + 2 * q * x * y + r * y * y);
@@ -164,15 +213,26 @@ function computeMoments(mass, state, cells, { min_variance: least }) {
 }
 
 function computeLogLikelihood(mass, state, { x, y }, { even, spread }) {
-  const lines = state.map(([u, v, weight, a, b, c]) => describeLogDensity([u, v, weight, a + 2 * spread[0], b, c + 2 * spread[0]]));
+  const lines = state.map(([u, v, weight, a, b, c]) =>
+    describeLogDensity([u, v, weight, a + 2 * spread[0], b, c + 2 * spread[0]]),
+  );
   const floor = (2 * Math.PI * even) / mass.length;
-  return sum(mass.map((part, k) => part * Math.log(floor + sum(lines.map((line) => Math.exp(computeLogDensity(line, x[k], y[k])))))));
+  return sum(
+    mass.map(
+      (part, k) => part * Math.log(floor + sum(lines.map((line) => Math.exp(computeLogDensity(line, x[k], y[k]))))),
+    ),
+  );
 }
 
-function measureShares(mass, state, cells, how) { // means of sharper shares of the mass, covariances of the shares
+function measureShares(mass, state, cells, how) {
+  // means of sharper shares of the mass, covariances of the shares
   const found = computeMoments(mass, state, cells, how);
   const parts = state.map(() => new Float64Array(mass.length));
-  share(mass, state, cells, (k, shares) => parts.forEach((part, i) => { part[k] = shares[i]; }));
+  share(mass, state, cells, (k, shares) =>
+    parts.forEach((part, i) => {
+      part[k] = shares[i];
+    }),
+  );
   return state.map((one, i) => {
     const most = parts[i].reduce((a, b) => Math.max(a, b), 1e-30);
     let [total, x, y] = [0, 0, 0];
@@ -187,7 +247,8 @@ function measureShares(mass, state, cells, how) { // means of sharper shares of 
   });
 }
 
-function merge(state) { // components less than a cell apart are one, with their moments together
+function merge(state) {
+  // components less than a cell apart are one, with their moments together
   const weights = state.map(([, , weight]) => weight);
   let into = state.map(([x, y]) => {
     const near = state.map(([u, v], k) => (Math.hypot(u - x, v - y) < 1 ? weights[k] : -1));
@@ -200,7 +261,11 @@ function merge(state) { // components less than a cell apart are one, with their
     if (!total) return [0, 0, 0, 1, 0, 1];
     const average = (of) => sum(parts.map((part) => part[2] * of(part))) / total;
     const [x, y] = [average(([u]) => u), average(([, v]) => v)];
-    const spread = [(u, v, a) => a + (u - x) ** 2, (u, v, a, b) => b + (u - x) * (v - y), (u, v, a, b, c) => c + (v - y) ** 2];
+    const spread = [
+      (u, v, a) => a + (u - x) ** 2,
+      (u, v, a, b) => b + (u - x) * (v - y),
+      (u, v, a, b, c) => c + (v - y) ** 2,
+    ];
     return [x, y, total, ...spread.map((of) => average(([u, v, , a, b, c]) => of(u, v, a, b, c)))];
   });
 }

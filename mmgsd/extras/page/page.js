@@ -1,4 +1,3 @@
-
 // The page: the explorer's pictures and marks, answered in the browser itself. Text from files only ever becomes text.
 
 import { fitInputSize, match, resize } from "./answer.js";
@@ -21,7 +20,10 @@ class Page {
     const button = (textContent, title, onclick) => make("button", { type: "button", textContent, title, onclick });
     this.pictures = ["left", "right"].map((word, side) => {
       const picture = new Picture(word, (files) => this.openFiles(files, side));
-      picture.name.parentNode.insertBefore(button("camera", `A picture by the camera as the ${word} one`, () => this.openCamera(side)), picture.input);
+      picture.name.parentNode.insertBefore(
+        button("camera", `A picture by the camera as the ${word} one`, () => this.openCamera(side)),
+        picture.input,
+      );
       return picture;
     });
     const { canvas } = this.pictures[0];
@@ -33,11 +35,24 @@ class Page {
       const node = make("button", { type: "button", title: "As the left picture, the next one as the right" }, image);
       return Object.assign(node, { onclick: () => this.openSample(file) });
     };
-    const text = `Tap or drag in the left picture: the right one shows every place that matches (${this.model.name}). `
-      + "Choose, drop, paste or take pictures of your own; they stay on this device.";
-    document.body.append(make("div", { className: "mmgsd-explorer" }, make("p", { textContent: text }),
-      make("div", { className: "mmgsd-pictures" }, ...this.pictures.map(({ box }) => box)), this.line, this.tables,
-      make("div", { className: "mmgsd-samples", hidden: !this.model.samples.length }, ...this.model.samples.map(thumbnail))));
+    const text =
+      `Tap or drag in the left picture: the right one shows every place that matches (${this.model.name}). ` +
+      "Choose, drop, paste or take pictures of your own; they stay on this device.";
+    document.body.append(
+      make(
+        "div",
+        { className: "mmgsd-explorer" },
+        make("p", { textContent: text }),
+        make("div", { className: "mmgsd-pictures" }, ...this.pictures.map(({ box }) => box)),
+        this.line,
+        this.tables,
+        make(
+          "div",
+          { className: "mmgsd-samples", hidden: !this.model.samples.length },
+          ...this.model.samples.map(thumbnail),
+        ),
+      ),
+    );
   }
 
   // ---- pictures
@@ -70,10 +85,19 @@ class Page {
   async openCamera(side) {
     let stream;
     try {
-      stream = await navigator.mediaDevices.getUserMedia({ video: { facingMode: "environment", width: { ideal: 1920 } } });
-    } catch { // no camera, no permission, or an address that is not https: a phone's own camera is asked by the file field
-      return Object.assign(make("input", { type: "file", accept: "image/*", capture: "environment",
-        onchange: ({ target }) => this.openFiles([...target.files], side) })).click();
+      stream = await navigator.mediaDevices.getUserMedia({
+        video: { facingMode: "environment", width: { ideal: 1920 } },
+      });
+    } catch {
+      // no camera, no permission, or an address that is not https: a phone's own camera is asked by the file field
+      return Object.assign(
+        make("input", {
+          type: "file",
+          accept: "image/*",
+          capture: "environment",
+          onchange: ({ target }) => this.openFiles([...target.files], side),
+        }),
+      ).click();
     }
     const video = make("video", { srcObject: stream, autoplay: true, muted: true, playsInline: true });
     const take = make("button", { type: "button", textContent: "take" });
@@ -102,14 +126,19 @@ class Page {
     this.update();
   }
 
-  update() { // have what is missing computed
+  update() {
+    // have what is missing computed
     this.draw();
     this.stale = true;
-    this.working ??= this.work().catch((error) => this.say(`It did not work: ${error.message}`, true))
-      .finally(() => { this.working = null; });
+    this.working ??= this.work()
+      .catch((error) => this.say(`It did not work: ${error.message}`, true))
+      .finally(() => {
+        this.working = null;
+      });
   }
 
-  async work() { // of a drag only the latest place: it never lags
+  async work() {
+    // of a drag only the latest place: it never lags
     this.session ??= await this.openSession();
     while (this.stale) {
       this.stale = false;
@@ -148,11 +177,18 @@ class Page {
     }
   }
 
-  async check(session) { // against what the library's own runtime has for a made-up picture
-    const { check: { factor, modulus, step, values, tolerance }, least_px: side } = this.model;
+  async check(session) {
+    // against what the library's own runtime has for a made-up picture
+    const {
+      check: { factor, modulus, step, values, tolerance },
+      least_px: side,
+    } = this.model;
     const pixels = Float32Array.from({ length: 3 * side ** 2 }, (_, k) => ((k * factor) % modulus) / modulus);
-    const { descriptors: { data } } = await this.run(session, pixels, [side, side]);
-    if (!values.every((value, k) => Math.abs(data[k * step] - value) <= tolerance)) throw new Error("it computes other descriptors");
+    const {
+      descriptors: { data },
+    } = await this.run(session, pixels, [side, side]);
+    if (!values.every((value, k) => Math.abs(data[k * step] - value) <= tolerance))
+      throw new Error("it computes other descriptors");
   }
 
   run(session, pixels, [width, height]) {
@@ -181,7 +217,12 @@ class Page {
   }
 
   paint(side, context, place, unit) {
-    const { answer, images: { [side]: { shown, faded, size } } } = this;
+    const {
+      answer,
+      images: {
+        [side]: { shown, faded, size },
+      },
+    } = this;
     drawImage(context, place, side && answer ? faded : shown, size);
     if (side === 0) return this.xy && drawPixel(context, place, unit, COLOURS[0], this.xy);
     if (!answer) return;
@@ -189,7 +230,13 @@ class Page {
     const heat = answer.heat.map((value) => 255 * Math.sqrt(value / most));
     const [rows, columns] = answer.shape;
     const colours = Uint8Array.from(this.model.heat_colours.flat());
-    drawImage(context, place, makeHeat({ heat: Uint8Array.from(heat), heat_size: [columns, rows] }, colours), size, true);
+    drawImage(
+      context,
+      place,
+      makeHeat({ heat: Uint8Array.from(heat), heat_size: [columns, rows] }, colours),
+      size,
+      true,
+    );
     answer.modes.forEach((mode) => {
       drawMode(context, place, unit, COLOURS[0], mode.ellipse, mode.weight, { faint: Boolean(answer.said) });
       if (!(mode.visible < this.model.likely)) drawPixel(context, place, 0.8 * unit, COLOURS[0], mode.xy); // hidden: hollow
@@ -199,16 +246,39 @@ class Page {
   makeTable({ xy, modes }) {
     const percent = (value) => `${(100 * value).toFixed(0)} %`;
     const row = (kind, cells) => make("tr", {}, ...cells.map((textContent) => make(kind, { textContent })));
-    const seen = (visible) => (visible === undefined ? [] : [`${visible < this.model.likely ? "hidden" : "seen"}, ${percent(visible)}`]);
-    const rows = modes.map((mode, k) => row("td", [k + 1, ...mode.xy.map((value) => value.toFixed(1)), percent(mode.weight),
-      `± ${mode.spread_px.toFixed(0)} px`, percent(mode.confidence), ...seen(mode.visible)]));
-    const head = ["match", "x px", "y px", "weight", "spread", "confidence", ...(modes[0]?.visible === undefined ? [] : ["seen there"])];
-    return make("table", {}, make("caption", { textContent: `Pixel (${xy.map((value) => value.toFixed(0)).join(", ")})` }),
-      make("thead", {}, row("th", head)), make("tbody", {}, ...rows));
+    const seen = (visible) =>
+      visible === undefined ? [] : [`${visible < this.model.likely ? "hidden" : "seen"}, ${percent(visible)}`];
+    const rows = modes.map((mode, k) =>
+      row("td", [
+        k + 1,
+        ...mode.xy.map((value) => value.toFixed(1)),
+        percent(mode.weight),
+        `± ${mode.spread_px.toFixed(0)} px`,
+        percent(mode.confidence),
+        ...seen(mode.visible),
+      ]),
+    );
+    const head = [
+      "match",
+      "x px",
+      "y px",
+      "weight",
+      "spread",
+      "confidence",
+      ...(modes[0]?.visible === undefined ? [] : ["seen there"]),
+    ];
+    return make(
+      "table",
+      {},
+      make("caption", { textContent: `Pixel (${xy.map((value) => value.toFixed(0)).join(", ")})` }),
+      make("thead", {}, row("th", head)),
+      make("tbody", {}, ...rows),
+    );
   }
 }
 
-function readImage(bitmap) { // its pixels, what is drawn of it, and that in stretched greys
+function readImage(bitmap) {
+  // its pixels, what is drawn of it, and that in stretched greys
   const size = [bitmap.width, bitmap.height];
   const paint = (width, height) => {
     const canvas = make("canvas", { width, height });
@@ -222,7 +292,10 @@ function readImage(bitmap) { // its pixels, what is drawn of it, and that in str
   const [shown] = paint(...small);
   const [faded, context] = paint(...small);
   const grey = context.getImageData(0, 0, ...small);
-  const levels = Float32Array.from({ length: grey.data.length / 4 }, (_, k) => (grey.data[4 * k] + grey.data[4 * k + 1] + grey.data[4 * k + 2]) / 3);
+  const levels = Float32Array.from(
+    { length: grey.data.length / 4 },
+    (_, k) => (grey.data[4 * k] + grey.data[4 * k + 1] + grey.data[4 * k + 2]) / 3,
+  );
   const sorted = levels.filter((_, k) => k % 9 === 0).sort();
   const [low, high] = [0.01, 0.99].map((share) => sorted[Math.floor(share * (sorted.length - 1))]);
   levels.forEach((level, k) => {
@@ -235,7 +308,8 @@ function readImage(bitmap) { // its pixels, what is drawn of it, and that in str
   return { size, shown, faded, pixels };
 }
 
-async function prepareOffline() { // once: only what the worker answers has the headers for several threads
+async function prepareOffline() {
+  // once: only what the worker answers has the headers for several threads
   if (!navigator.serviceWorker) return; // an address that is neither https nor this machine's
   try {
     await navigator.serviceWorker.register("worker.js");
