@@ -31,11 +31,12 @@ TORCH := 2.13.0
 PY := .venv/bin/python
 PIP := env -u PYTHONDONTWRITEBYTECODE $(PY) -m pip --disable-pip-version-check install --quiet --only-binary :all:
 STAMP := .venv/.installed
+SITE := .venv/docs
 PYTEST := OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(PY) -m pytest --numprocesses $(JOBS) --dist loadfile --no-loadscope-reorder
 PAPERMILL := $(PY) -m papermill --kernel python3
 
-.PHONY: help .venv reproduce smoke test lint unit notebooks-test figures paper readme weights data-sample \
-	lab lock clean clean-all force
+.PHONY: help .venv reproduce smoke test lint unit notebooks-test figures paper readme docs weights data-sample \
+	lab lock docs-lock clean clean-all force
 
 help: ## List the targets
 	@grep -hE '^[.a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | awk -F'\t' '{ printf "  make %-15s %s\n", $$1, $$2 }'
@@ -63,8 +64,17 @@ figures: $(STAMP) ## Draw the paper's figures of PRESET (paper) again from data/
 	@mkdir -p data/generated
 	$(PAPERMILL) notebooks/07_figures.ipynb data/generated/figures_$(PRESET).ipynb -p preset $(PRESET) -p run True
 
-readme: $(STAMP) ## Put the numbers of data/results into README.md, the results page and docs/claims.md
+readme: $(STAMP) ## Put the numbers of data/results into README.md, the results page and docs/claims.md; make docs/api.md
 	$(PY) -m mmgsd.report.tables data/results README.md data/results/README.md docs/claims.md
+	$(PY) -m mmgsd.extras.interface docs/api.md
+
+# Its tools are no part of the environment: only who builds the site needs them.
+docs: $(STAMP) ## Build the pages and the reference as a site in data/generated/docs; a dead link fails
+	@[ "$$(cat $(SITE)/.lock 2>/dev/null)" = "$$(sha256sum docs/requirements.lock)" ] || { rm -rf $(SITE) && \
+		$(PIP) --require-hashes --no-deps --target $(SITE) -r docs/requirements.lock && \
+		sha256sum docs/requirements.lock > $(SITE)/.lock; }
+	PYTHONPATH=$(SITE) $(PY) -m sphinx -W --keep-going --quiet -c docs . data/generated/docs
+	@echo "data/generated/docs/index.html"
 
 data-sample: $(STAMP) ## Copy 24 images of each object of PRESET into data/sample
 	$(PY) -m mmgsd.extras.sampling $(PRESET)
@@ -132,6 +142,13 @@ lock: ## Make environment.lock from pyproject.toml (UV=uv, FIND_LINKS=folder wit
 	@sed -i -E 's/-r -(, |$$)//; s/, $$//' environment.new
 	cat environment.head environment.new > environment.lock
 	@rm environment.head environment.new
+
+docs-lock: ## Make docs/requirements.lock from docs/requirements.in, with the pins of environment.lock (UV=uv)
+	@grep -oE '^[A-Za-z0-9_.-]+==[^ ]+' environment.lock | grep -v '^torch==' > docs/constraints.new
+	$(UV) pip compile --quiet --python-version 3.11 --generate-hashes --no-header --annotation-style line \
+		--constraint docs/constraints.new --output-file docs/requirements.lock docs/requirements.in
+	@sed -i -E 's/-c [^,]*(, |$$)//; s/, $$//' docs/requirements.lock
+	@rm docs/constraints.new
 
 # --- cleaning ----------------------------------------------------------------------------------------------------
 clean: ## Remove caches and what the preset smoke made

@@ -77,8 +77,9 @@ def make_parser() -> argparse.ArgumentParser:
     _add_measure(commands.add_parser("measure", help="measure on photographs with marked corners or ends"))
     _add_fold(commands.add_parser("fold", help="say where to pick and place in a picture, as a demonstration did"))
     _add_export(commands.add_parser("export", help="write a network as ONNX: image in, descriptors out"))
+    _add_page(commands.add_parser("page", help="write a folder of static files that matches in a browser"))
     for name, command in commands.choices.items():
-        default = {"default": "cloth"} if name == "measure" else {"required": True}
+        default = {"default": "cloth"} if name in ("measure", "page") else {"required": True}
         command.add_argument("--weights", metavar="FILE", **default,
                              help="a trained model (safetensors), or a name in data/weights, like cloth")  # fmt: skip
     _add_measures(commands)
@@ -185,6 +186,13 @@ def _add_measure(measure: argparse.ArgumentParser) -> None:
 def _add_export(export: argparse.ArgumentParser) -> None:
     export.add_argument("--out", type=Path, required=True, metavar="FILE", help="the file to write, .onnx")
     export.set_defaults(run=cli.export)
+
+
+def _add_page(page: argparse.ArgumentParser) -> None:
+    page.add_argument("out", type=Path, metavar="OUT", help="the folder to write; docs/page.md says how to host it")
+    page.add_argument("--runtime", type=Path, metavar="FOLDER",
+                      help="the npm package onnxruntime-web, unpacked; by default npm downloads it")  # fmt: skip
+    page.set_defaults(run=cli.page)
 
 
 def _parse_image(text: str) -> Path:

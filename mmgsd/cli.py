@@ -267,6 +267,15 @@ def export(args: argparse.Namespace) -> None:
           "bfloat16 for some layers on a CPU, by up to 1e-2")  # fmt: skip
 
 
+def page(args: argparse.Namespace) -> None:
+    """Write a page that matches in a browser."""
+    from mmgsd.extras.page import make_page
+
+    folder = make_page(mmgsd.load(args.weights), args.out, name=Path(args.weights).stem, runtime=args.runtime)
+    size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+    print(f"{folder}: {size / 1e6:.0f} MB; to try it: python -m http.server --directory {folder}")
+
+
 def calibrate(args: argparse.Namespace) -> None:
     """Fit what ellipses, radii and confidences promise, and keep it in the file of weights."""
     from mmgsd.measure.calibration import calibrate_unseen, calibrate_weights

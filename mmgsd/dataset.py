@@ -1,10 +1,12 @@
 """The data set on disk: its format, its checker and reader, and how pairs of images are drawn from it.
 
-dataset.json      object, image size, symmetry groups, mirror (optional), seed, versions, number of images of each
-                  split, SHA-256 of labels.parquet (optional); `mmgsd.dataset_format` tests each
-labels.parquet    one row an image: file, mask, split, episode, view, xy, visible, intrinsics, camera_pose, state …;
-                  present (optional), False where the object is not there: no visible point, an empty mask
-images/*.webp     lossless colour images          masks/*.png    1-bit object masks
+Its files::
+
+    dataset.json      object, image size, symmetry groups, mirror (optional), seed, versions, number of images of each
+                      split, SHA-256 of labels.parquet (optional); `mmgsd.dataset_format` tests each
+    labels.parquet    one row an image: file, mask, split, episode, view, xy, visible, intrinsics, camera_pose, state …;
+                      present (optional), False where the object is not there: no visible point, an empty mask
+    images/*.webp     lossless colour images          masks/*.png    1-bit object masks
 """
 
 from __future__ import annotations

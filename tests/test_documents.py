@@ -31,7 +31,7 @@ TRIED = {
     "papermill": "test_notebooks_have_the_parameters_that_commands_give_them, test_run_all.py",
     "mmgsd": "test_commands_are_parsed",
     "pytest": "this", "ruff": "make lint", "pip": "test_wheel.py, test_extras_exist",
-    "git": "needs a network", "cd": "a folder of the reader's",
+    "git": "needs a network", "http": "Python's own", "cd": "a folder of the reader's",
 }  # fmt: skip
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 

@@ -111,7 +111,7 @@ def run_installed(
 def test_the_wheel_holds_every_module_and_the_shipped_weights(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         held = {name for name in archive.namelist() if ".dist-info/" not in name}
-    kinds = {".py", ".js", ".css", ".typed"}
+    kinds = {".py", ".js", ".css", ".html", ".typed"}
     modules = {str(path.relative_to(ROOT)) for path in (ROOT / "mmgsd").rglob("*") if path.suffix in kinds}
     kinds = {".safetensors", ".md"}
     shipped = {f"mmgsd/weights/{path.name}" for path in (ROOT / "data" / "weights").iterdir() if path.suffix in kinds}

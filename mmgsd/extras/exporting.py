@@ -19,7 +19,8 @@ from mmgsd.match.matcher import Matcher
 from mmgsd.model.network import compute_input_size
 from mmgsd.numerics import own_numerics
 
-TOLERANCE = 1e-3  # of an output, relative to its largest value
+TOLERANCE = {False: 1e-3, True: 1e-2}  # of an output, relative to its largest value; True: of weights in half precision
+HALVED = 64  # numbers from which on a tensor is worth halving
 STEP_PX = 8  # both sides of an input are multiples of it
 OUTPUTS = {  # what is exported of `Outputs`, and its axes that an image changes
     "descriptors": {0: "batch", 2: "rows", 3: "columns"},
@@ -30,7 +31,7 @@ OUTPUTS = {  # what is exported of `Outputs`, and its axes that an image changes
 
 
 @own_numerics()
-def export_onnx(matcher: Matcher, path: Path | str) -> float:
+def export_onnx(matcher: Matcher, path: Path | str, *, half: bool = False) -> float:
     """Write what `Matcher.describe` does as ``path``: ``image`` (B, 3, H, W) in [0, 1], ``descriptors`` (B, C, …) out.
 
     H and W are multiples of 8 from `Matcher.least_px` on: resize an image, keeping its aspect, to about as many pixels
@@ -44,8 +45,10 @@ def export_onnx(matcher: Matcher, path: Path | str) -> float:
 
     What onnxruntime makes of random images of four shapes is compared with torch, both in single precision: returns the
     largest difference, relative to the largest value. On a CPU, where `Matcher.describe` takes bfloat16 for some of its
-    layers, its descriptors differ from the file's by up to a hundredth. ValueError for another ending than .onnx,
-    RuntimeError where they differ by more than 1e-3 in single precision; ``path`` is then as it was.
+    layers, its descriptors differ from the file's by up to a hundredth. With ``half`` weights are stored in half
+    precision, and computed with in single: half the size, on any machine. ValueError for another ending than .onnx,
+    RuntimeError where they differ by more than 1e-3 in single precision, or of ``half`` 1e-2; ``path`` is then as it
+    was.
     """
     path = Path(path)
     if path.suffix != ".onnx":
@@ -56,9 +59,9 @@ def export_onnx(matcher: Matcher, path: Path | str) -> float:
     shapes = ((2, height, width), (1, width, height + STEP_PX), (1, height + 2 * STEP_PX, width), (1, least, least))
     images = [torch.rand((count, 3, *size), generator=generator, dtype=torch.float32) for count, *size in shapes]
     with writing(path) as aside:
-        _write(network, images[0][:1], aside, _describe(matcher, (width, height)))
+        _write(network, images[0][:1], aside, _describe(matcher, (width, height)), half)
         difference = max(_compare(network, aside, image) for image in images)
-        if not difference <= TOLERANCE:
+        if not difference <= TOLERANCE[half]:
             raise RuntimeError(f"onnxruntime's descriptors differ from torch's by {difference:.1e}: {path} is not "
                                "written")  # fmt: skip
     return difference
@@ -116,7 +119,7 @@ def _describe(matcher: Matcher, size: tuple[int, int]) -> dict[str, str]:
     return {name: str(value) for name, value in numbers.items()} | {n: json.dumps(v) for n, v in values.items()}
 
 
-def _write(network: _Described, image: Tensor, path: Path, metadata: dict[str, str]) -> None:
+def _write(network: _Described, image: Tensor, path: Path, metadata: dict[str, str], half: bool) -> None:
     axes = {"image": {0: "batch", 2: "height", 3: "width"}, **{name: OUTPUTS[name] for name in network.names}}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # torch's older exporter, which needs no further package, says it is the older
@@ -124,6 +127,8 @@ def _write(network: _Described, image: Tensor, path: Path, metadata: dict[str, s
                           output_names=network.names, dynamic_axes=axes)  # fmt: skip
     model = onnx.load(path)
     _name_weights(model.graph)
+    if half:
+        _halve_weights(model.graph)
     onnx.helper.set_model_props(model, metadata)
     onnx.save(model, path)
 
@@ -141,6 +146,16 @@ def _name_weights(graph: onnx.GraphProto) -> None:
             kept.append(node)
     del graph.node[:]
     graph.node.extend(kept)
+
+
+def _halve_weights(graph: onnx.GraphProto) -> None:
+    """Store weights in half precision; runtimes cast them back when they load the file."""
+    for k, weight in enumerate(graph.initializer):
+        values = onnx.numpy_helper.to_array(weight)
+        if values.dtype == np.float32 and values.size >= HALVED:
+            name = weight.name
+            graph.initializer[k].CopyFrom(onnx.numpy_helper.from_array(values.astype(np.float16), f"{name}.half"))
+            graph.node.insert(0, onnx.helper.make_node("Cast", [f"{name}.half"], [name], to=onnx.TensorProto.FLOAT))
 
 
 def _compare(network: _Described, path: Path, image: Tensor) -> float:

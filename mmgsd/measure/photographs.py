@@ -1,6 +1,6 @@
 """How much of what is visible in photographs does a matcher find? Measured at marked corners, ends or like places.
 
-The photographs are described by a JSON file, a list of dictionaries, one a photograph; other keys are ignored:
+The photographs are described by a JSON file, a list of dictionaries, one a photograph; other keys are ignored::
 
     file      relative to the JSON file
     kind      what it shows: "cloth", "rope", the name of an object of yours; without it, what the model was taught
@@ -14,7 +14,7 @@ The photographs are described by a JSON file, a list of dictionaries, one a phot
               photographs are cropped to the cloth
 
 The first of the five that is there counts. Each place of `SOURCES` photographs, evenly spread over the file (of cloths
-only those with all corners), is asked for in every other photograph with places:
+only those with all corners), is asked for in every other photograph with places::
 
     found@5%, found@10%   share of the marked places that have a mode nearer than 5, 10 % of the object's size
     spurious              share of the k modes most probably seen (`Match.seen_first`; the surest ones where that is not

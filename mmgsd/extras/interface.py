@@ -1,0 +1,103 @@
+"""docs/api.md, the interface in tables and in full, made from docstrings: ``python -m mmgsd.extras.interface``."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import inspect
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from mmgsd import cli
+from mmgsd.__main__ import make_parser
+from mmgsd.command import run_command
+from mmgsd.files import write_text
+
+HEAD = """# The interface
+
+Made from the docstrings by `make readme`, which writes it anew. Images are RGB, pixels (column, row), the centre of the
+top left one (0, 0); S counts the pixels asked about, n their modes. `pip install mmgsd` brings what answers need,
+`'mmgsd[plot]'` what draws them, and `'mmgsd[notebooks]'` baselines, ONNX, pages and measuring. Each command has a
+`--help`.
+"""
+PARTS = {  # title: names below `mmgsd`, of classes with all their public members
+    "Loading": ("load", "read_image", "find_samples", "compute_rays"),
+    "Asking": ("match.matcher.Matcher", "match.matcher.Pair"),
+    "Answers": ("match.match.Match", "match.match.Best", "match.describe.describe_answer"),
+    "Baselines and features of others": ("match.baselines.FeatureMatcher", "match.baselines.BaselineMatcher"),
+    "Folding by a demonstration": ("fold.demonstration.read_demonstration", "fold.moves.answer_picture"),
+    "Photographs": ("measure.photographs.read_photographs", "measure.photographs.measure_photographs"),
+    "Other programs": ("extras.exporting.export_onnx", "extras.page.make_page"),
+}
+
+
+def make_interface() -> str:
+    """The page's Markdown: a table of each part, then every docstring in full."""
+    parts = {title: [entry for name in names for entry in _list_entries(name)] for title, names in PARTS.items()}
+    commands = [(f"`mmgsd {name}`", _shorten(text)) for name, text in _list_commands()]
+    lines = [HEAD, *_make_table("From a shell", commands)]
+    for title, entries in parts.items():
+        lines += _make_table(title, [(f"[`{name}`](#{_anchor(name)})", _shorten(text)) for name, _, text in entries])
+    lines.append("## In full\n")
+    for entries in parts.values():
+        lines += [f"### {name}\n\n`{call}`\n\n{text}\n" for name, call, text in entries]
+    return "\n".join(lines)
+
+
+def _list_entries(place: str) -> Iterator[tuple[str, str, str]]:
+    """Name, call and docstring of what a dotted name below `mmgsd` is, and of a class's own public members."""
+    module, _, name = place.rpartition(".")
+    thing = getattr(importlib.import_module(f"mmgsd.{module}" if module else "mmgsd"), name)
+    name = name if module else f"mmgsd.{name}"
+    yield name, name + _sign(thing), _to_markdown(thing)
+    for member, value in vars(thing).items() if inspect.isclass(thing) else ():
+        value = getattr(value, "__func__", getattr(value, "fget", getattr(value, "func", value)))  # of a property
+        if inspect.isfunction(value) and not member.startswith("_"):
+            called = _sign(value) if callable(getattr(thing, member)) else ""
+            yield f"{name}.{member}", f"{name}.{member}{called}", _to_markdown(value)
+
+
+def _list_commands() -> Iterator[tuple[str, str]]:
+    for action in make_parser()._actions:
+        for name in action.choices or ():
+            yield name, inspect.getdoc(getattr(cli, name))
+
+
+def _sign(thing: Any) -> str:
+    """The parameters, without what their docstring says of them."""
+    signature = inspect.signature(thing)
+    given = [one for name, one in signature.parameters.items() if name not in ("self", "cls")]
+    known = [one.replace(annotation=one.empty) for one in given]
+    text = str(signature.replace(parameters=known, return_annotation=signature.empty))
+    return re.sub(r"=<.*? at 0x[0-9a-f]+>", "=…", text)  # of a function, which has another address each time
+
+
+def _to_markdown(thing: Any) -> str:
+    text = re.sub(r"^(``\w+``(?:, ``\w+``)*)  ", r"- \1: ", inspect.getdoc(thing) or "", flags=re.MULTILINE)
+    return text.replace("``", "`")
+
+
+def _shorten(text: str) -> str:
+    """The first sentence, in a cell of a table."""
+    return re.split(r"(?<=[.;])\s", " ".join(text.split()).replace("``", "`"))[0].rstrip(".;").replace("|", "\\|")
+
+
+def _anchor(name: str) -> str:
+    return re.sub(r"[^\w-]", "", name.lower())
+
+
+def _make_table(title: str, rows: list[tuple[str, str]]) -> list[str]:
+    return [f"## {title}\n", "| | |", "|---|---|", *(f"| {name} | {text} |" for name, text in rows), ""]
+
+
+def main() -> None:
+    """Write the page."""
+    parser = argparse.ArgumentParser(prog="python -m mmgsd.extras.interface", description=__doc__)
+    parser.add_argument("document", type=Path, help="the file to write, docs/api.md")
+    write_text(parser.parse_args().document, make_interface())
+
+
+if __name__ == "__main__":
+    run_command(main)
