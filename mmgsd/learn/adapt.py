@@ -67,7 +67,8 @@ DRAWN, RENDERS = 4, 6  # photographs of a step, each as it is and among other th
 RATE = 1e-4  # learning rate: a tenth of the training's
 SIGMA_PX = 4.0  # std of the targets: marks by hand are no better
 SPAN = 16  # steps that the average of weights spans
-QUESTIONS = {"pairs": 60, "points": 65}  # about the sample's renders
+CALIBRATED = 100  # pairs of test renders that the calibration is read from
+QUESTIONS = {"pairs": 24, "points": 25}  # about the test renders
 ASKED, RESULT = "asked.json", "after-{}.json"  # the latter: what was found of a part left out after so many steps
 
 CARD = """# {name}
@@ -261,7 +262,7 @@ class _Job:
                                                                                    ("after", matcher))}  # fmt: skip
         tensors, note = read_tensors(source)
         if taken:
-            calibration = calibrate_modes(matcher, data)
+            calibration = calibrate_modes(matcher, data, pairs=CALIBRATED)
             note |= {} if calibration is None else {"calibration": calibration.to_json()}
             new = {**matcher.network.state_dict(), PLACES: matcher.places}
             tensors = {name: value.detach().cpu().to(tensors.get(name, value).dtype) for name, value in new.items()}
