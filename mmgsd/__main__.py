@@ -174,7 +174,7 @@ def _add_adapt(adapt: argparse.ArgumentParser) -> None:
                        help="photographs, with marks in an index.json as measure reads it, or such a file")  # fmt: skip
     adapt.add_argument("--out", type=Path, required=True, metavar="FILE", help="the weights to write (safetensors)")
     adapt.add_argument("--renders", type=Path, metavar="FOLDER",
-                       help="a data set of the object; it keeps what the weights know (default: the sample)")  # fmt: skip
+                       help="a data set of the object: it keeps what is known (default: the sample)")  # fmt: skip
     adapt.add_argument("--overwrite", action="store_true", help="replace weights that were made of anything else")
     adapt.set_defaults(run=cli.adapt)
 

@@ -240,7 +240,7 @@ class _Job:
             self.advance(run, stop, f"adapt, part {number + 1} left out")
             file = folder / RESULT.format(stop)
             if not file.is_file():
-                write_json(file, _ask(run.make_matcher(), sources, targets).to_dict("records"), indent=None)
+                write_json(file, ask_left_out(run.make_matcher(), sources, targets).to_dict("records"), indent=None)
             found[stop] = pd.DataFrame(read_json(file))
         return found
 
@@ -334,11 +334,11 @@ class _Adaptation(Run):
         return json.dumps([self.job.asked, dataclasses.asdict(self.config), self.chosen], sort_keys=True)
 
 
-def _ask(matcher: Matcher, sources: list[Photograph], targets: list[Photograph]) -> pd.DataFrame:
+def ask_left_out(matcher: Matcher, sources: list[Photograph], targets: list[Photograph]) -> pd.DataFrame:
     """A row a query about the targets, "by" a "picture" of the sources or by "name"."""
     tables = [score_answer(answer, photograph).assign(by="picture")
               for photograph, answer in ask_photographs(matcher, sources, targets=targets, progress=False)]  # fmt: skip
-    if matcher.object in ENDS:
+    if matcher.object in ENDS and matcher.places is not None:
         name = ENDS[matcher.object][0]
         tables += [score_answer(matcher.find(t.read(), name), t).assign(by="name") for t in targets]
     return pd.concat(tables, ignore_index=True)
@@ -347,7 +347,7 @@ def _ask(matcher: Matcher, sources: list[Photograph], targets: list[Photograph])
 def choose_stop(found: Sequence[dict[int, pd.DataFrame]]) -> int:
     """The number of steps after which most is found at 5 % less what is spurious; the least of several.
 
-    ``found`` {steps: rows of `_ask`} of each part that was left out: all photographs weigh the same.
+    ``found`` {steps: rows of `ask_left_out`} of each part that was left out: all photographs weigh the same.
     """
     scores = {}
     for stop in found[0]:
