@@ -61,7 +61,7 @@ from mmgsd.numerics import own_numerics
 from mmgsd.paths import find_sample_sets
 from mmgsd.progress import ProgressBar
 
-STEPS, FOLDS = 160, 3
+STEPS, FOLDS = 120, 3
 STOPS = 4  # numbers of steps, evenly spaced, of which the best is taken
 DRAWN, RENDERS = 4, 6  # photographs of a step, each as it is and among other things, and renders
 RATE = 1e-4  # learning rate: a tenth of the training's
