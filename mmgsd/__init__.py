@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mmgsd.images import read_image
+    from mmgsd.learn.adapt import adapt
     from mmgsd.match.camera import compute_rays
     from mmgsd.match.match import Match
     from mmgsd.match.matcher import Matcher, load
@@ -19,9 +20,9 @@ if TYPE_CHECKING:
     from mmgsd.paths import find_samples
 
 __version__ = "0.1.0"
-__all__ = ["Match", "Matcher", "Track", "Tracker", "compute_rays", "find_samples", "load", "read_image"]
-_PLACES = {"Match": "match.match", "Matcher": "match.matcher", "compute_rays": "match.camera", "find_samples": "paths",
-           "load": "match.matcher", "read_image": "images"}  # fmt: skip
+__all__ = ["Match", "Matcher", "Track", "Tracker", "adapt", "compute_rays", "find_samples", "load", "read_image"]
+_PLACES = {"Match": "match.match", "Matcher": "match.matcher", "adapt": "learn.adapt", "compute_rays": "match.camera",
+           "find_samples": "paths", "load": "match.matcher", "read_image": "images"}  # fmt: skip
 _PLACES |= dict.fromkeys(("Track", "Tracker"), "match.track")
 
 

@@ -75,11 +75,12 @@ def make_parser() -> argparse.ArgumentParser:
     _add_track(commands.add_parser("track", help="follow points of the first frame through a video, each as itself"))
     _add_segment(commands.add_parser("segment", help="write where an image shows the object"))
     _add_measure(commands.add_parser("measure", help="measure on photographs with marked corners or ends"))
+    _add_adapt(commands.add_parser("adapt", help="go on from weights with photographs of yours"))
     _add_fold(commands.add_parser("fold", help="say where to pick and place in a picture, as a demonstration did"))
     _add_export(commands.add_parser("export", help="write a network as ONNX: image in, descriptors out"))
     _add_page(commands.add_parser("page", help="write a folder of static files that matches in a browser"))
     for name, command in commands.choices.items():
-        default = {"default": "cloth"} if name in ("measure", "page") else {"required": True}
+        default = {"default": "cloth"} if name in ("measure", "adapt", "page") else {"required": True}
         command.add_argument("--weights", metavar="FILE", **default,
                              help="a trained model (safetensors), or a name in data/weights, like cloth")  # fmt: skip
     _add_measures(commands)
@@ -181,6 +182,16 @@ def _add_measure(measure: argparse.ArgumentParser) -> None:
     measure.add_argument("--store", metavar="NAME", help="write the numbers to data/results/photographs_NAME.json")
     measure.add_argument("--json", action="store_true", help="print the numbers as JSON")
     measure.set_defaults(run=cli.measure)
+
+
+def _add_adapt(adapt: argparse.ArgumentParser) -> None:
+    adapt.add_argument("folder", type=Path, metavar="FOLDER",
+                       help="photographs, with marks in an index.json as measure reads it, or such a file")  # fmt: skip
+    adapt.add_argument("--out", type=Path, required=True, metavar="FILE", help="the weights to write (safetensors)")
+    adapt.add_argument("--renders", type=Path, metavar="FOLDER",
+                       help="a data set of the object: it keeps what is known (default: the sample)")  # fmt: skip
+    adapt.add_argument("--overwrite", action="store_true", help="replace weights that were made of anything else")
+    adapt.set_defaults(run=cli.adapt)
 
 
 def _add_export(export: argparse.ArgumentParser) -> None:

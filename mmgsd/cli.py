@@ -252,6 +252,12 @@ def measure(args: argparse.Namespace) -> None:
     print(json.dumps(results) if args.json else make_photographs_table(results), flush=True)
 
 
+def adapt(args: argparse.Namespace) -> None:
+    """Go on from weights with photographs, and print the card of what that did."""
+    out = mmgsd.adapt(args.folder, args.weights, args.out, renders=args.renders, overwrite=args.overwrite)
+    print(out.with_suffix(".md").read_text("utf-8"), end="")
+
+
 def samples(args: argparse.Namespace) -> None:
     """Print the paths of the sample images of an object, a line each."""
     print(*mmgsd.find_samples(args.object), sep="\n")

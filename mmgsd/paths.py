@@ -56,8 +56,14 @@ def find_shipped() -> Path:
 def find_samples(object: str = "cloth") -> tuple[Path, Path]:
     """Two image files of a ``cloth`` or a ``rope`` that no weights learnt from; ValueError for another object."""
     check_choice("object", object, OBJECTS)
-    folder = _find_folder(f"samples/{object}", f"sample/{object}/images")
+    folder = _find_folder("samples", "sample") / object / "images"
     return tuple(folder / name for name in SAMPLES[object])
+
+
+def find_sample_sets(object: str) -> list[Path]:
+    """The sample's data sets of an object, the cluttered one last; [] of one that it does not show."""
+    folder = _find_folder("samples", "sample")
+    return [place for place in (folder / object, folder / "workspace" / object) if place.is_dir()]
 
 
 def _find_folder(installed: str, checkout: str) -> Path:

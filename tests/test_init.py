@@ -15,7 +15,7 @@ import mmgsd
 from mmgsd.config import OBJECTS
 from mmgsd.match.match import Best
 
-PUBLIC = ["Match", "Matcher", "Track", "Tracker", "compute_rays", "find_samples", "load", "read_image"]
+PUBLIC = ["Match", "Matcher", "Track", "Tracker", "adapt", "compute_rays", "find_samples", "load", "read_image"]
 
 
 def test_completion_and_help_show_every_public_name() -> None:

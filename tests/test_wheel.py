@@ -18,7 +18,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from mmgsd.config import OBJECTS
-from mmgsd.paths import find_samples
+from mmgsd.paths import find_sample_sets
 
 ROOT = Path(__file__).resolve().parents[1]
 SAMPLE = ROOT / "data" / "sample" / "cloth" / "images"
@@ -115,7 +115,9 @@ def test_the_wheel_holds_every_module_and_the_shipped_weights(wheel: Path) -> No
     modules = {str(path.relative_to(ROOT)) for path in (ROOT / "mmgsd").rglob("*") if path.suffix in kinds}
     kinds = {".safetensors", ".md"}
     shipped = {f"mmgsd/weights/{path.name}" for path in (ROOT / "data" / "weights").iterdir() if path.suffix in kinds}
-    samples = {f"mmgsd/samples/{name}/{path.name}" for name in OBJECTS for path in find_samples(name)}
+    sets = [place for name in OBJECTS for place in find_sample_sets(name)]
+    sample = [path.relative_to(ROOT / "data" / "sample") for place in sets for path in place.rglob("*.*")]
+    samples = {f"mmgsd/samples/{path.as_posix()}" for path in sample}
     assert held == modules | shipped | samples
 
 

@@ -126,15 +126,15 @@ def warp_images(
     ``images`` (h, w, 3) uint8 or (h, w) uint8, all of one resolution, of an image of ``full`` = (W, H) px. What
     enters from outside is mirrored background, or nothing (0) for a mask. Returns (size[1], size[0], …) each.
     """
-    columns, rows = (_scale(np.arange(n), n, whole) for n, whole in zip(size, full, strict=True))
+    columns, rows = (rescale(np.arange(n), n, whole) for n, whole in zip(size, full, strict=True))
     found = warp.find_grid_source(columns, rows)
-    source = _scale(found, full, images[0].shape[1::-1]).astype(np.float32)
+    source = rescale(found, full, images[0].shape[1::-1]).astype(np.float32)
     borders = [cv2.BORDER_CONSTANT if image.ndim == 2 else cv2.BORDER_REFLECT_101 for image in images]
     return [cv2.remap(image, source, None, cv2.INTER_LINEAR, borderMode=border)
             for image, border in zip(images, borders, strict=True)]  # fmt: skip
 
 
-def _scale(positions: np.ndarray, source: ArrayLike, target: ArrayLike) -> np.ndarray:
+def rescale(positions: np.ndarray, source: ArrayLike, target: ArrayLike) -> np.ndarray:
     """Px of an image with ``source`` px a side as px of its copy with ``target``, pixel centres integer."""
     return (positions + 0.5) * (np.asarray(target) / np.asarray(source)) - 0.5
 
@@ -214,5 +214,5 @@ def _borrow(images: TrainingImages, rng: np.random.Generator) -> tuple[np.ndarra
 
 def _look_up(covered: np.ndarray, xy: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """Which of the px (P, 2) of an image of ``size`` are covered in its copy (h, w) bool."""
-    columns, rows = np.rint(_scale(xy, size, covered.shape[::-1])).astype(int).T
+    columns, rows = np.rint(rescale(xy, size, covered.shape[::-1])).astype(int).T
     return covered[rows.clip(0, covered.shape[0] - 1), columns.clip(0, covered.shape[1] - 1)]

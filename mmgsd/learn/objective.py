@@ -58,10 +58,34 @@ def compute_loss(
         far, apart = _sample_non_matches(config, target, batch, pair, source, modes, size, generator)
         function = losses.pcl if config.method == "pcl" else losses.spcl
         return function((match + 1e-12).sqrt(), valid, (far + 1e-12).sqrt(), apart, margin=config.margin)
-    xs, ys = (c.to(descriptors.device) for c in compute_cell_centres(size, descriptors.shape[-2:]))
-    wanted = losses.compute_target(modes, valid, xs, ys, compute_sigma(config, step))
-    squared = compute_squared_distances(source, target[pair[1]].flatten(2).mT)
-    return losses.mmgsd(squared, wanted)
+    return _compute_mixture_loss(source, target[pair[1]], modes, valid, size, compute_sigma(config, step))
+
+
+def compute_place_loss(
+    config: TrainConfig, descriptors: Tensor, batch: Batch, places: Tensor, permutations: Tensor,
+    size: tuple[int, int], step: int,
+) -> Tensor:  # fmt: skip
+    """The distributional loss of what `Matcher.find` asks: ``places`` (P, D) are the sources, each image a target.
+
+    ``permutations`` (G, P) are of the first P points of the batch; a point counts where it is seen in the image.
+    """
+    generator = torch.Generator(descriptors.device).manual_seed(config.seed * 1_000_003 + step)
+    seen = batch.askable[:, : len(places)]  # (B, P)
+    points = torch.multinomial(seen.float() + 1e-9, config.queries, True, generator=generator)  # (B, Q)
+    rows, orbit = torch.arange(len(points), device=points.device), permutations[:, points].permute(1, 2, 0)
+    modes = batch.xy[rows[:, None, None], orbit]  # (B, Q, G, 2)
+    valid = batch.inside[rows[:, None, None], orbit] & seen[rows[:, None], points][..., None]
+    target = descriptors[:, -config.descriptor_dim :]  # (B, D, h, w)
+    return _compute_mixture_loss(places[points], target, modes, valid, size, compute_sigma(config, step))
+
+
+def _compute_mixture_loss(
+    source: Tensor, target: Tensor, modes: Tensor, valid: Tensor, size: tuple[int, int], sigma_px: float
+) -> Tensor:
+    """Of sources (K, Q, D) in images with ``target`` (K, D, h, w), whose true matches are ``modes`` (K, Q, G, 2)."""
+    xs, ys = (c.to(target.device) for c in compute_cell_centres(size, target.shape[-2:]))
+    wanted = losses.compute_target(modes, valid, xs, ys, sigma_px)
+    return losses.mmgsd(compute_squared_distances(source, target.flatten(2).mT), wanted)
 
 
 def compute_head_loss(

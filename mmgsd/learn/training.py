@@ -86,12 +86,12 @@ def train_model(
     if parts[0].object != config.object:
         raise ValueError(f"object is {config.object!r}, but {dataset} shows a {parts[0].object}")
     with distributed.joined(config.groups, find_device(device)) as team, held(folder, team), (
-        _repeatable(team.device)
+        repeatable(team.device)
     ):  # fmt: skip
         # by the process that held the folder before
         if not overwrite and is_trained(weights, dataset, also=config.also):
             return weights
-        run = _Run(config, parts, folder, team, validate_every)  # what is wrong is said before anything is deleted
+        run = Run(config, parts, folder, team, validate_every)  # what is wrong is said before anything is deleted
         if overwrite and team.rank == 0:
             remove_run(folder)
         team.wait()
@@ -107,8 +107,13 @@ def train_model(
     return weights
 
 
-class _Run:
-    """A training run that can be killed between any two steps."""
+class Run:
+    """A training run that can be killed between any two steps.
+
+    What derives from it learns from something else: it calls `start` in its own ``__init__``, with what is set there.
+    """
+
+    frozen_statistics = False  # of batch normalisation
 
     def __init__(
         self, config: TrainConfig, parts: list[Dataset], folder: Path, team: distributed.Team, validate_every: int = 0
@@ -126,22 +131,26 @@ class _Run:
         self.images = load_training_images(self.data, config.input_px)
         torch.manual_seed(config.seed)
         network, places = _make_network(config, folder.parent)
-        self.network = network.to(device, memory_format=torch.channels_last)
-        # the average of the last steps' weights, statistics of batch normalisation included, is what is kept
-        average = get_ema_multi_avg_fn(1 - 1 / max(2.0, config.steps / 50))
-        self.average = AveragedModel(self.network, multi_avg_fn=average, use_buffers=True)
         start = places  # as the descriptors that the training goes on with lie
         if start is None or start.shape != (data.n_points, config.descriptor_dim):
             start = make_prototypes(self.data.xy, known, config.descriptor_dim, math.hypot(*data.size))
-        self.prototypes = torch.nn.Parameter(start.to(device))
+        self.start(network, start, span=config.steps / 50)
+
+    def start(self, network: torch.nn.Module, prototypes: Tensor, *, span: float) -> None:
+        """Before the first step; ``config``, ``folder``, ``team`` and ``device`` are set. ``span`` of the average."""
+        self.network = network.to(self.device, memory_format=torch.channels_last)
+        # the average of the last steps' weights, statistics of batch normalisation included, is what is kept
+        average = get_ema_multi_avg_fn(1 - 1 / max(2.0, span))
+        self.average = AveragedModel(self.network, multi_avg_fn=average, use_buffers=True)
+        self.prototypes = torch.nn.Parameter(prototypes.to(self.device))
         self.trained = [p for p in self.network.parameters() if p.requires_grad]
-        self.optimisers = make_optimisers(self.network, [self.prototypes], config)
+        self.optimisers = make_optimisers(self.network, [self.prototypes], self.config)
         self.step, self.seconds, self.saved_at, self.saved_step, self.log = 0, 0.0, 0.0, 0, []
 
     def advance(self) -> float:
         """One optimiser step; saves a checkpoint every ``CHECKPOINT_SECONDS``."""
         start = time.perf_counter()
-        self.network.train()
+        self.network.train(not self.frozen_statistics)
         for optimiser in self.optimisers:
             optimiser.param_groups[0]["lr"] = compute_learning_rate(self.config, self.step)
             optimiser.zero_grad(set_to_none=True)
@@ -297,7 +306,7 @@ class _Run:
 
 
 @contextmanager
-def _repeatable(device: torch.device) -> Iterator[None]:
+def repeatable(device: torch.device) -> Iterator[None]:
     """Sums in the same order every time, on a CPU: a GPU has no such kernel for the gradient of sampling."""
     before, filled = torch.are_deterministic_algorithms_enabled(), deterministic.fill_uninitialized_memory
     torch.use_deterministic_algorithms(before or device.type == "cpu")

@@ -33,6 +33,7 @@ import hashlib
 import json
 import re
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -42,7 +43,7 @@ import pandas as pd
 
 from mmgsd.dataset import load_dataset
 from mmgsd.files import DamagedFileError, read_json, write_json, write_text
-from mmgsd.images import check_pixels, find_beside, read_image
+from mmgsd.images import check_pixels, find_beside, list_images, read_image
 from mmgsd.match.match import Match
 from mmgsd.match.matcher import Matcher, find_weights
 from mmgsd.paths import find_root
@@ -67,6 +68,7 @@ class Photograph:
     size_px: float | None  # of the object; None: to be estimated from the image's size
     share: float  # of the image's longer side that is its size then
     askable: bool  # all of the object's places are marked
+    by: str = ""  # the key of `PLACES` that its marks have
 
     def read(self) -> np.ndarray:
         """(H, W, 3) uint8; ValueError, which names the file, where a mark is outside or the file cannot be read."""
@@ -86,35 +88,60 @@ def read_photographs(place: Path | str, kind: str) -> list[Photograph]:
     path = Path(place) / INDEX if Path(place).is_dir() else Path(place)
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist: give a folder with {INDEX}, or such a file")
-    entries = read_json(path)
-    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-        raise DamagedFileError(f"{path} must be a list of dictionaries, one a photograph")
-    chosen = [_read_entry(path, k, entry) for k, entry in enumerate(entries) if entry.get("kind", kind) == kind]
-    photographs = [photograph for photograph in chosen if photograph]
+    photographs = [photograph for photograph in _read_index(path, kind) if len(photograph.xy)]
     if len(photographs) < 2 or not any(photograph.askable for photograph in photographs):
         raise ValueError(f"{path} must mark at least two photographs of kind {kind!r}, and all corners of one cloth, "
                          f"got {len(photographs)} marked")  # fmt: skip
     return photographs
 
 
-def _read_entry(path: Path, number: int, entry: dict[str, Any]) -> Photograph | None:
-    """None of one without a marked place."""
+def read_all_photographs(place: Path | str, kind: str) -> list[Photograph]:
+    """The photographs of a ``kind`` in a folder or a file that describes some, those without a mark as well.
+
+    The images of a folder that its ``index.json`` does not name, or that has none, have no mark. Errors are those of
+    `read_photographs`, but for their number, and of `mmgsd.images.list_images`.
+    """
+    folder, path = Path(place), Path(place) / INDEX if Path(place).is_dir() else Path(place)
+    if not folder.is_dir():
+        return _read_index(path, kind)
+    if not path.is_file():
+        return [_leave_unmarked(file) for file in list_images(folder)]
+    named, files = {find_beside(path, str(entry.get("file"))).resolve() for entry in _read_entries(path)}, []
+    with suppress(ValueError):  # they may all lie elsewhere
+        files = list_images(folder)
+    return [*_read_index(path, kind), *(_leave_unmarked(file) for file in files if file.resolve() not in named)]
+
+
+def _leave_unmarked(file: Path) -> Photograph:
+    return Photograph(file, "own", np.zeros((0, 2)), None, SIZE_SHARE, False)
+
+
+def _read_index(path: Path, kind: str) -> list[Photograph]:
+    return [_read_entry(path, k, e) for k, e in enumerate(_read_entries(path)) if e.get("kind", kind) == kind]
+
+
+def _read_entries(path: Path) -> list[dict[str, Any]]:
+    entries = read_json(path)
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        raise DamagedFileError(f"{path} must be a list of dictionaries, one a photograph")
+    return entries
+
+
+def _read_entry(path: Path, number: int, entry: dict[str, Any]) -> Photograph:
     name, where = entry.get("file"), f"{path}, photograph {number}"
     if not isinstance(name, str) or not name:
         raise DamagedFileError(f"{where}: file must be a path, got {name!r}")
     by, marked = next(((key, seen) for key in PLACES if (seen := _list_seen(entry.get(key), where, key))), ("", []))
-    if not marked:
-        return None
-    whole = by == "corners" and len(marked) == len(entry[by])
+    whole = by == "corners" and 0 < len(marked) == len(entry[by])
     size_px = entry.get("size_px")
     if size_px is not None and not (isinstance(size_px, int | float) and 0 < size_px < np.inf):
         raise DamagedFileError(f"{where}: size_px must be a number above 0, got {size_px!r}")
-    xy = np.array(marked, float)
+    xy = np.array(marked, float).reshape(-1, 2)
     if size_px is None and whole:
         size_px = float(np.linalg.norm(xy - np.roll(xy, 1, 0), axis=1).mean())
     share = STICKERED_SHARE if entry.get("visible_corner_stickers") or entry.get("stickers") else SIZE_SHARE
     askable = whole or by in ("ends", "marks")
-    return Photograph(find_beside(path, name), str(entry.get("repo") or "own"), xy, size_px, share, askable)
+    return Photograph(find_beside(path, name), str(entry.get("repo") or "own"), xy, size_px, share, askable, by)
 
 
 def _list_seen(places: Any, where: str, key: str) -> list[list[float]]:
@@ -187,16 +214,19 @@ def store_photographs(results: dict[str, Any], name: str) -> Path:
 
 
 def ask_photographs(
-    matcher: Any, photographs: list[Photograph], *, sources: int = SOURCES, progress: bool = True
-) -> Iterator[tuple[Photograph, Match]]:
+    matcher: Any, photographs: list[Photograph], *, targets: list[Photograph] | None = None, sources: int = SOURCES,
+    progress: bool = True,
+) -> Iterator[tuple[Photograph, Match]]:  # fmt: skip
     """(photograph, answer) for the places of the sources in each other photograph, which is read and described once.
 
-    ``matcher``: anything with ``match_many``.
+    ``matcher``: anything with ``match_many``. ``targets`` are asked about in place of the others. Where no photograph
+    has all of its places marked, any is a source.
     """
-    askable = [photograph for photograph in photographs if photograph.askable]
+    askable = [photograph for photograph in photographs if photograph.askable] or photographs
     spread = np.linspace(0, len(askable) - 1, min(sources, len(askable))).round().astype(int)
     read = [(source, source.read()) for source in (askable[k] for k in np.unique(spread))]
-    pairs = [(source, target) for target in photographs for source in read if source[0].path != target.path]
+    targets = photographs if targets is None else targets
+    pairs = [(source, target) for target in targets for source in read if source[0].path != target.path]
 
     def ask() -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """Both images and the pixels of each pair; a target is read once."""

@@ -1,0 +1,193 @@
+"""How many photographs of one's own does `mmgsd.adapt` need? Measured by repositories of photographs that others took.
+
+    python -m mmgsd.studies.adaptation FOLDER                   every cell -> data/results/adaptation.json
+    python -m mmgsd.studies.adaptation FOLDER --object cloth --counts 5 --splits 1 --steps 32     a few of them
+
+FOLDER holds photographs and an index.json with marks and the ``repo`` of each (`mmgsd.measure.photographs`). Of each
+repository that has enough, some are learnt from, with their marks or without; asked about are those of it that no count
+of the split learns from, and those of all others, each by the same two pictures and by name. The weights are thrown
+away. What is measured is kept, so that a killed call goes on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib import pyplot as plt
+from matplotlib.figure import Figure
+
+from mmgsd.command import run_command
+from mmgsd.config import OBJECTS
+from mmgsd.figures.style import COLUMN_IN, check_filled, finish_axes, styled
+from mmgsd.files import write_json
+from mmgsd.learn.adapt import STEPS, adapt, ask_left_out, read_adaptation
+from mmgsd.match.matcher import Matcher, load
+from mmgsd.measure.evaluation import read_results
+from mmgsd.measure.photographs import Photograph, read_photographs
+from mmgsd.paths import find_root
+from mmgsd.progress import ProgressBar
+
+RESULTS = "adaptation.json"
+COUNTS = (2, 5, 10, 20)  # photographs that are learnt from
+KINDS = {"marked": "with marks", "unmarked": "without marks"}
+SPLITS = 5
+SOURCES = 2  # photographs of every split that are asked by
+LEFT = 4  # a part so large of a repository, at least, is left to be asked about
+ASKED = {"own": "same repository", "others": "other repositories"}
+COLUMNS = ("found@5%", "spurious")
+
+Cell = tuple[str, str, str, int, int]  # object, repository, kind, count, split; count 0: the weights as they are
+
+
+def list_cells(
+    photographs: Mapping[str, Sequence[Photograph]], *, counts: Sequence[int] = COUNTS, splits: int = SPLITS
+) -> Iterator[Cell]:
+    """What is measured of {object: photographs}, the weights as they are first in each split."""
+    for name, all_of_it in photographs.items():
+        for repository, number in Counter(photograph.source for photograph in all_of_it).items():
+            kept = [count for count in counts if count <= find_most(number)]
+            ways = [("marked", 0), *((kind, count) for count in kept for kind in KINDS)] if kept else []
+            yield from ((name, repository, *way, split) for split in range(splits) for way in ways)
+
+
+def find_most(count: int) -> int:
+    """How many photographs of a repository that has so many are learnt from at most, 0 of too small a one."""
+    return max((c for c in COUNTS if c <= count - max(1, count // LEFT)), default=0)
+
+
+def run(
+    folder: Path | str, *, objects: Sequence[str] = OBJECTS, counts: Sequence[int] = COUNTS, splits: int = SPLITS,
+    steps: int = STEPS, weights: Mapping[str, str] | None = None, out: Path | None = None, progress: bool = True,
+) -> Path:  # fmt: skip
+    """Measure every cell that is missing; returns the path of the results (default: data/results/adaptation.json).
+
+    ``weights`` {object: name or path} to go on from, by default the shipped ones. Errors are those of
+    `mmgsd.measure.photographs.read_photographs`.
+    """
+    out = find_root() / "data" / "results" / RESULTS if out is None else out
+    photographs = {object: read_photographs(folder, object) for object in objects}
+    cells = list(list_cells(photographs, counts=counts, splits=splits))
+    for cell in ProgressBar(cells, desc="adaptation", disable=not progress, leave=False):
+        rows, key = read_results(out), "/".join(map(str, cell))
+        start = (weights or {}).get(cell[0], cell[0])
+        if key not in rows:
+            write_json(out, {**rows, key: measure_cell(cell, photographs[cell[0]], start, steps=steps)})
+    return out
+
+
+def measure_cell(cell: Cell, photographs: Sequence[Photograph], weights: str, *, steps: int) -> dict[str, Any]:
+    """{"own", "others": {by: {measure: mean}}} and ``rmse_px`` of adapted weights on renders, or why they refused."""
+    _, repository, kind, count, split = cell
+    own = [photograph for photograph in photographs if photograph.source == repository]
+    order = np.random.default_rng(split).permutation(len(own))
+    targets = {"own": [own[k] for k in order[find_most(len(own)) :]],
+               "others": [photograph for photograph in photographs if photograph.source != repository]}  # fmt: skip
+    sources = [own[k] for k in order[:SOURCES]]
+    if not count:
+        return _ask(load(weights), sources, targets)
+    with tempfile.TemporaryDirectory() as place:
+        index = write_json(Path(place) / "index.json", [_describe(own[k], kind) for k in order[:count]])
+        try:
+            file = adapt(index, weights, Path(place) / "adapted.safetensors", steps=steps, folds=0, progress=False)
+        except ValueError as error:  # such as nothing that the weights are sure of
+            return {"refused": str(error)}
+        return _ask(load(file), sources, targets) | {"rmse_px": read_adaptation(file)["rmse_px"]}
+
+
+def _describe(photograph: Photograph, kind: str) -> dict[str, Any]:
+    """The index's entry of a photograph."""
+    entry = {"file": str(photograph.path.absolute())}
+    return entry | ({photograph.by: photograph.xy.tolist()} if kind == "marked" else {})
+
+
+def _ask(matcher: Matcher, sources: list[Photograph], targets: Mapping[str, list[Photograph]]) -> dict[str, Any]:
+    found = {}
+    for name, chosen in targets.items():
+        if chosen:
+            means = ask_left_out(matcher, sources, chosen).groupby("by")[list(COLUMNS)].mean().round(4)
+            found[name] = means.to_dict("index")
+    return found
+
+
+def tabulate(results: Mapping[str, Any]) -> pd.DataFrame:
+    """A row a cell, place ("own", "others") and way of asking; of cells that were not refused."""
+    rows = []
+    for key, found in results.items():
+        object, rest = key.split("/", 1)
+        repository, kind, count, split = rest.rsplit("/", 3)
+        error = found.get("rmse_px")
+        told = {"object": object, "repository": repository, "kind": kind, "count": int(count), "split": int(split),
+                "grown": error["after"] / error["before"] - 1 if error else 0.0}  # fmt: skip
+        for place in ASKED:
+            rows += [{**told, "place": place, "by": by, **means} for by, means in found.get(place, {}).items()]
+    return pd.DataFrame(rows)
+
+
+def _average(rows: pd.DataFrame, keys: list[str]) -> pd.DataFrame:
+    """Means over splits, then over repositories; the weights as they are stand beside only those that were adapted."""
+    return rows.groupby([*keys, "repository"])[[*COLUMNS, "grown"]].mean().groupby(keys).mean()
+
+
+def table(results: Mapping[str, Any]) -> str:
+    """Markdown: what is found and spurious by number of photographs, and how much renders' error grows."""
+    means = _average(tabulate(results), ["object", "kind", "count", "place", "by"])
+    ways = [(place, by) for place in ASKED for by in ("name", "picture")]
+    heads = [f"{ASKED[place]}, by {by}: found / spurious" for place, by in ways]
+    lines = ["| | " + " | ".join([*heads, "renders' error"]) + " |", "|---" * (len(heads) + 2) + "|"]
+    for (object, kind, count), part in means.groupby(level=[0, 1, 2], sort=False):
+        cells = [_format(part, (object, kind, count, *way)) for way in ways]
+        label = f"{object}, {count} {KINDS[kind]}" if count else f"{object}, as shipped"
+        lines.append(f"| {' | '.join([label, *cells, f'{part.grown.mean():+.0%}'])} |")
+    return "\n".join(lines)
+
+
+def _format(part: pd.DataFrame, key: tuple[Any, ...]) -> str:
+    return " / ".join(f"{100 * part.loc[key, name]:.0f} %" for name in COLUMNS) if key in part.index else "–"
+
+
+@styled
+def figure(results: Mapping[str, Any], *, by: str = "name") -> Figure:
+    """Found within 5 % of the size against the number of photographs, an object a panel; dashed: other repositories."""
+    check_filled("results", results)
+    rows = tabulate(results)
+    rows = rows[rows["by"] == by]
+    objects = [name for name in OBJECTS if name in set(rows["object"])]
+    figure, axes = plt.subplots(1, len(objects), figsize=(COLUMN_IN, 1.9), layout="constrained", squeeze=False)
+    for axis, name in zip(axes[0], objects, strict=True):
+        for colour, kind in enumerate(KINDS):
+            for place, style in zip(ASKED, ("-", "--"), strict=True):
+                known = (rows["kind"] == kind) | (rows["count"] == 0)
+                shown = rows[known & (rows["object"] == name) & (rows["place"] == place)]
+                means = _average(shown, ["count"])["found@5%"]
+                axis.plot(means.index, 100 * means, f"o{style}", ms=3, color=f"C{colour}",
+                          label=f"{KINDS[kind]}, {ASKED[place]}")  # fmt: skip
+        axis.set(title=name.capitalize(), xlabel="photographs", ylim=(0, 100))
+    axes[0, 0].set_ylabel("found within 5 % (%)")
+    axes[0, -1].legend(fontsize=5)
+    return finish_axes(figure)
+
+
+def main() -> None:
+    """Measure what is missing, and print the table."""
+    parser = argparse.ArgumentParser(prog="python -m mmgsd.studies.adaptation", description=__doc__.split("\n")[0])
+    parser.add_argument("folder", type=Path, metavar="FOLDER")
+    parser.add_argument("--object", choices=OBJECTS, action="append", help="one of them alone")
+    parser.add_argument("--counts", type=int, nargs="+", default=COUNTS, choices=COUNTS)
+    parser.add_argument("--splits", type=int, default=SPLITS)
+    parser.add_argument("--steps", type=int, default=STEPS)
+    parser.add_argument("--out", type=Path, help="another results file")
+    args = parser.parse_args()
+    how = {"counts": args.counts, "splits": args.splits, "steps": args.steps, "out": args.out}
+    print(table(json.loads(run(args.folder, objects=args.object or OBJECTS, **how).read_text("utf-8"))))
+
+
+if __name__ == "__main__":
+    run_command(main)
