@@ -81,7 +81,8 @@ def _add_commands(commands: Any, table: Mapping[str, tuple[str, str]], words: li
         command = commands.add_parser(name, help=line, formatter_class=argparse.RawDescriptionHelpFormatter)
         if words[:1] == [name]:
             function = _load(place)
-            command.description, _, command.epilog = inspect.getdoc(function).partition("\n\n")
+            documented = function if place.startswith("cli.") else sys.modules[function.__module__]  # with examples
+            command.description, _, command.epilog = inspect.getdoc(documented).partition("\n\n")
             add_arguments(command, function)
 
 

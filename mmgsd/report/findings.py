@@ -24,14 +24,14 @@ SECTIONS = {
     "longer": "does-more-training-help", "where": "where-is-the-error",
     "uncertainty": "does-an-answer-know-how-wrong-it-is",
 }  # fmt: skip
-MATRIX = "`.venv/bin/python -m mmgsd.studies.matrix paper`"
+MATRIX = "`.venv/bin/python -m mmgsd run models paper`"
 REPEATS = {  # claim: what repeats it, and the models of runs.json that it trains
     "rmse": (MATRIX, ("mmgsd_plain",)),
     "rmse-dense": ("`03_train`, `04_evaluate`", ("mmgsd",)),
     "improvement": (MATRIX, ("mmgsd_plain", "mmgsd", "spcl", "spcl_dense")),
     "sigma": ("`05_sigma_ablation`", ()),
     "stable": (f"{MATRIX[:-1]} --seeds 3 --steps 1000`", ()),
-    "continuous": ("`.venv/bin/python -m mmgsd.studies.continuity`", ("mmgsd", "spcl")),
+    "continuous": ("`.venv/bin/python -m mmgsd run continuity`", ("mmgsd", "spcl")),
     "interior": ("`04_evaluate`, `07_figures`", ("mmgsd",)),
     "bimodal": ("`04_evaluate`, `07_figures`", ("mmgsd",)),
     "hand-made": ("`04_evaluate`", ()),
@@ -40,8 +40,8 @@ REPEATS = {  # claim: what repeats it, and the models of runs.json that it train
     "entropy": ("`06_uncertainty`", ("mmgsd",)),
     "inward": ("`08_symmetry_study`", ()),
     "hidden": ("`09_error_analysis`", ("mmgsd",)),
-    "surest": ("`.venv/bin/python -m mmgsd.studies.grasp paper`", ()),
-    "several": ("`.venv/bin/python -m mmgsd.studies.folding paper`", ()),
+    "surest": ("`.venv/bin/python -m mmgsd run grasp paper`", ()),
+    "several": ("`.venv/bin/python -m mmgsd run folding paper`", ()),
     "group": ("`08_symmetry_study`", ()),
 }
 STUDIES = {

@@ -1,16 +1,14 @@
 """Do the matches of neighbouring material points neighbour each other? MMGSD beside SPCL, both of clean images alone.
 
-python -m mmgsd.studies.continuity    the shipped weights about the sample -> data/results/paper/continuity.json
+    python -m mmgsd run continuity    the shipped weights about the sample -> data/results/paper/continuity.json
 """
 
 from __future__ import annotations
 
-import argparse
 from typing import Any
 
 import numpy as np
 
-from mmgsd.command import run_command
 from mmgsd.config import OBJECTS, EvaluateConfig
 from mmgsd.dataset import Dataset
 from mmgsd.files import write_json
@@ -57,12 +55,7 @@ def _list_neighbours(offsets: np.ndarray, data: Dataset) -> list[tuple[np.ndarra
 
 def main() -> None:
     """Measure the shipped weights that learnt from the paper's images alone."""
-    argparse.ArgumentParser(prog="python -m mmgsd.studies.continuity", description=__doc__).parse_args()
     root = find_root()
     rows = {name: {method: measure_jumps(load_shipped(name, method), load_sample(root, name)) for method in PAPER_SIZE}
             for name in OBJECTS}  # fmt: skip
     print(write_json(Paths(root, "paper").results / "continuity.json", rows))
-
-
-if __name__ == "__main__":
-    run_command(main)

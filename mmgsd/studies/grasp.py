@@ -1,6 +1,6 @@
 """Take the corner that you are surest of: one grasp by one pixel's matches, and what it lifts.
 
-    python -m mmgsd.studies.grasp paper    -> data/results/paper/grasp.json
+    python -m mmgsd run grasp paper    -> data/results/paper/grasp.json
 
 A policy is shown one corner of a flat cloth, and a picture of another cloth; it grasps at one of the four modes,
 carries what it holds to the middle of what it sees, and lets go. A corner is lifted where one then lies within `NEAR`
@@ -9,14 +9,13 @@ of the side of that place. A killed run goes on.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
-from mmgsd.command import run_command
+from mmgsd.command import Option
 from mmgsd.config import DEFAULT_GROUP
 from mmgsd.files import write_json
 from mmgsd.fold.jobs import act_job, read_state, run_jobs
@@ -100,14 +99,10 @@ def summarise_grasps(rows: Mapping[str, Outcome], others: Mapping[str, Outcome])
             "lifted": estimate_share([bool(row["lifted"]) for row in rows.values()])}  # fmt: skip
 
 
-def main() -> None:
+def main(
+    preset: Annotated[str, Option(choices=ROLLOUTS)],
+    *,
+    workers: Annotated[int, Option("child processes at once (default: one a core)")] = 0,
+) -> None:
     """Grasp with every matcher."""
-    parser = argparse.ArgumentParser(prog="python -m mmgsd.studies.grasp", description=__doc__.split("\n")[0])
-    parser.add_argument("preset", choices=tuple(ROLLOUTS))
-    parser.add_argument("--workers", type=int, default=0, help="child processes at once (default: one a core)")
-    args = parser.parse_args()
-    print(run_grasps(args.preset, find_root(), workers=args.workers))
-
-
-if __name__ == "__main__":
-    run_command(main, kept="finished states are kept, and the same command goes on")
+    print(run_grasps(preset, find_root(), workers=workers))

@@ -1,9 +1,9 @@
 """What shipped weights, and what one would pick instead, do on clean renders, on cluttered ones and on photographs.
 
-    python -m mmgsd.studies.shipped cloth cloth-paper daisy --photographs FOLDER    -> data/results/shipped.json
-    python -m mmgsd.studies.shipped cloth@1,1 --photographs FOLDER     its modes read with another power and sharpness
-    python -m mmgsd.studies.shipped robustness --photographs FOLDER    the models of that study, once they are trained
-    python -m mmgsd.studies.shipped cloth --cloth-renders FOLDER       and others' renders of a cloth
+    python -m mmgsd run shipped cloth cloth-paper daisy --photographs FOLDER    -> data/results/shipped.json
+    python -m mmgsd run shipped cloth@1,1 --photographs FOLDER     its modes read with another power and sharpness
+    python -m mmgsd run shipped robustness --photographs FOLDER    the models of that study, once they are trained
+    python -m mmgsd run shipped cloth --cloth-renders FOLDER       and others' renders of a cloth
 
 A row a name: of weights in data/weights; of a baseline, which is asked about each object with the true masks, and in
 photographs with those that the shipped weights see, and whose modes are read as theirs; or of each model of a study of
@@ -16,13 +16,12 @@ killed call goes on.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from mmgsd.checks import read_count
-from mmgsd.command import run_command
+from mmgsd.command import Option
 from mmgsd.config import OBJECTS, PRESETS, Preset, load_preset
 from mmgsd.files import write_json
 from mmgsd.match.baselines import BASELINES, OPTIONAL
@@ -35,6 +34,7 @@ from mmgsd.studies.models import PAPER, ROWS, SHIPPED, configure_study, get_labe
 
 STUDIES = ("robustness", "backbones")
 RESULTS = "shipped.json"
+NAMES = ", ".join((*BASELINES, *OPTIONAL, *STUDIES))  # that may be measured besides weights
 Rows = Mapping[str, Mapping[str, Any]]  # data/results/shipped.json, {name: what `mmgsd.measure.shipped` found}
 SETS = {"paper": "clean", "workspace": "cluttered"}  # test images: what readers know them as
 SIDES = {"cloth": "side", "rope": "length"}  # of what an error is a share
@@ -253,53 +253,43 @@ def measure_study(
     missing = [str(file) for file in files.values() if not file.is_file()]
     if missing:
         asked = f"{preset.name} --study {study}" + (f" --steps {steps}" if steps else "")
-        raise FileNotFoundError(f"{missing[0]} does not exist: run python -m mmgsd.studies.matrix {asked}")
+        raise FileNotFoundError(f"{missing[0]} does not exist: run python -m mmgsd run models {asked}")
     how = {"photographs": photographs, "presets": (preset.name, preset.cluttered)}
     return {key: measure_weights(key, root, weights=file, **how) | {"preset": preset.name, "steps": models[key].steps}
             for key, file in files.items()}  # fmt: skip
 
 
-def _measure(name: str, root: Path, args: argparse.Namespace) -> dict[str, dict[str, Any]]:
+def _measure(
+    name: str, root: Path, of_study: dict[str, Any], photographs: Path | None, alone: bool, cloth_renders: Path | None
+) -> dict[str, dict[str, Any]]:
     """The rows of a name that is asked for."""
     if name in STUDIES:
-        how = {"objects": (args.object,) if args.object else (), "steps": args.steps, "photographs": args.photographs}
-        return measure_study(name, root, load_preset(args.preset), **how)
-    how = {"photographs": args.photographs, "presets": () if args.photographs_alone else measured.SETS}
+        return measure_study(name, root, **of_study, photographs=photographs)
+    how = {"photographs": photographs, "presets": () if alone else measured.SETS}
     if name in (*BASELINES, *OPTIONAL):
         rows = {f"{object}-{name}": measure_baseline(name, object, root, **how) for object in OBJECTS}
         return {name_read(key, row): row for key, row in rows.items()}
     measure = measure_read if "@" in name else measure_weights
-    return {name: measure(name, root, cloth_renders=args.cloth_renders, **how)}
+    return {name: measure(name, root, cloth_renders=cloth_renders, **how)}
 
 
-def main() -> None:
+def main(
+    *names: Annotated[str, Option(f"weights in data/weights, alone or with @POWER,SHARPNESS, {NAMES}", metavar="NAME")],
+    photographs: Annotated[Path, Option("marked photographs, with index.json", metavar="FOLDER")] | None = None,
+    photographs_alone: Annotated[bool, Option("leave the presets' test images out: they take longest")] = False,
+    cloth_renders: Annotated[Path, Option("others' renders, with knots_info.json", metavar="FOLDER")] | None = None,
+    preset: Annotated[str, Option("of the study (default: paper)", choices=PRESETS)] = "paper",
+    steps: Annotated[int, Option("of each model of a study (default: the study's own)")] = 0,
+    object: Annotated[str, Option("of a study's models those of one object", choices=OBJECTS)] = "",
+) -> None:
     """Measure some weights and baselines and put their rows into the results."""
-    parser = argparse.ArgumentParser(prog="python -m mmgsd.studies.shipped", description=__doc__.split("\n")[0])
-    parser.add_argument(
-        "names",
-        nargs="+",
-        metavar="NAME",
-        help=f"weights in data/weights, alone or with @POWER,SHARPNESS, {', '.join((*BASELINES, *OPTIONAL, *STUDIES))}",
-    )
-    parser.add_argument("--photographs", type=Path, metavar="FOLDER", help="marked photographs, with index.json")
-    parser.add_argument(
-        "--photographs-alone", action="store_true", help="leave the presets' test images out: they take longest"
-    )
-    parser.add_argument("--cloth-renders", type=Path, metavar="FOLDER", help="others' renders, with knots_info.json")
-    parser.add_argument("--preset", default="paper", choices=tuple(PRESETS), help="of the study (default: paper)")
-    parser.add_argument("--steps", type=int, default=0, help="of each model of a study (default: the study's own)")
-    parser.add_argument("--object", default="", choices=OBJECTS, help="of a study's models those of one object")
-    args = parser.parse_args()
-    root, args.steps = find_root(), read_count("--steps", args.steps)
-    out = root / "data" / "results" / RESULTS
-    for name in args.names:
-        rows = _measure(name, root, args)
+    root, steps = find_root(), read_count("--steps", steps)
+    out, of_study = root / "data" / "results" / RESULTS, {"objects": (object,) if object else (), "steps": steps}
+    of_study |= {"preset": load_preset(preset)}
+    for name in names:
+        rows = _measure(name, root, of_study, photographs, photographs_alone, cloth_renders)
         kept = read_results(out)
         for key, row in rows.items():  # photographs are not at everybody's hand: a call without them keeps the row's
             before = kept.get(key, {})
             kept[key] = (before if before.get("sha256") == row.get("sha256") else {}) | row
         print(f"{write_json(out, kept)}: {', '.join(rows)}")
-
-
-if __name__ == "__main__":
-    run_command(main)

@@ -311,7 +311,7 @@ def test_training_asks_for_the_images_that_were_left_out(empty_root, notebook):
     [
         ("04_evaluate", {}, "run 03_train with run=True for it first"),
         ("06_uncertainty", {}, "run 03_train with run=True for it first"),
-        ("09_error_analysis", {"method": "pcl"}, "for preset='smoke', method='pcl' there is no .*studies.matrix"),
+        ("09_error_analysis", {"method": "pcl"}, "for preset='smoke', method='pcl' there is no .*run models"),
     ],
 )
 def test_a_method_that_is_not_trained_is_named(empty_root, notebook, told, by):
