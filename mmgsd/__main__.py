@@ -51,7 +51,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 def _run(words: list[str]) -> None:
     given = make_parser(words).parse_args(words)
-    place, _ = STUDIES[given.study] if given.command == "run" else COMMANDS[given.command]
+    place, _ = STUDIES[given._study] if given._command == "run" else COMMANDS[given._command]
     kept = KEPT
     if place.startswith("cli."):
         kept = _say_kept(given)
@@ -68,11 +68,11 @@ def make_parser(words: list[str]) -> argparse.ArgumentParser:
     """The commands, of which the one that ``words`` begin with has its arguments: no other is imported."""
     prog = "python -m mmgsd" if Path(sys.argv[0]).name == "__main__.py" else "mmgsd"
     parser = argparse.ArgumentParser(prog=prog, description=mmgsd.__doc__.partition("\n")[0])
-    commands = parser.add_subparsers(dest="command", required=True, metavar="command")
+    commands = parser.add_subparsers(dest="_command", required=True, metavar="command")
     _add_commands(commands, COMMANDS, words)
     line = "run a study, or train what studies compare"
     run = commands.add_parser("run", help=line, description=f"{line[0].upper()}{line[1:]}.")
-    _add_commands(run.add_subparsers(dest="study", required=True, metavar="study"), STUDIES, words[1:])
+    _add_commands(run.add_subparsers(dest="_study", required=True, metavar="study"), STUDIES, words[1:])
     return parser
 
 

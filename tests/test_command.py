@@ -15,7 +15,7 @@ import pytest
 from mmgsd.__main__ import COMMANDS, STUDIES, make_parser
 from mmgsd.command import Option, add_arguments, call, run_command
 
-LATER = " (Python 3.11 or later)"
+LATER = "brings it (Python 3.11 or later)"
 ROOT = Path(__file__).resolve().parents[1]
 
 
@@ -34,7 +34,7 @@ def raising(error: BaseException) -> Callable[[], None]:
         (FileNotFoundError("a.json does not exist: render it"), 2, "a.json does not exist: render it"),
         (RuntimeError("folder is in use"), 1, "folder is in use"),
         (KeyError("cloth"), 1, "KeyError: 'cloth' (set MMGSD_TRACEBACK=1 to see where)"),
-        (ModuleNotFoundError(name="onnx"), 2, "onnx is not installed: pip install 'mmgsd[notebooks]' brings it" + LATER),
+        (ModuleNotFoundError(name="onnx"), 2, "onnx is not installed: pip install 'mmgsd[notebooks]' " + LATER),
         (ModuleNotFoundError(name="seaborn"), 2, "seaborn is not installed: pip install 'mmgsd[plot]' brings it"),
         (MemoryError(), 1, "MemoryError (set MMGSD_TRACEBACK=1 to see where)"),
     ],
