@@ -15,7 +15,7 @@ import torch
 
 from mmgsd.command import Option
 from mmgsd.config import OBJECTS, TrainConfig, load_preset
-from mmgsd.files import DamagedFileError, ForeignFileError, locked, set_aside, write_bytes, write_text
+from mmgsd.files import DamagedFileError, ForeignFileError, is_kept, locked, set_aside, write_bytes, write_text
 from mmgsd.measure.calibration import calibrate_weights
 from mmgsd.measure.evaluation import read_results
 from mmgsd.measure.shipped import SETS
@@ -115,20 +115,9 @@ def restore_model(shipped: Path, folder: Path, config: TrainConfig) -> Path:
         raise ValueError(f"{shipped} is {theirs.name}, and {config.name} was asked for: train that one")
     weights = folder / WEIGHTS
     with locked(folder, "restoring"):
-        if not _is_whole(weights):
+        if not is_kept(weights, read_tensors):  # whole ones, whatever they hold, are kept
             write_bytes(weights, shipped.read_bytes())
     return weights
-
-
-def _is_whole(weights: Path) -> bool:
-    """Whether there are weights; damaged ones are set aside."""
-    if not weights.is_file():
-        return False
-    try:
-        read_tensors(weights)
-    except DamagedFileError:
-        set_aside(weights)
-    return weights.is_file()
 
 
 def _holds(file: Path, state: dict[str, torch.Tensor], note: dict[str, str]) -> bool:
