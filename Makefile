@@ -42,10 +42,10 @@ help: ## List the targets
 	@grep -hE '^[.a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | awk -F'\t' '{ printf "  make %-15s %s\n", $$1, $$2 }'
 
 reproduce: $(STAMP) ## Run the whole experiment, preset quick: render, train, evaluate, draw
-	$(PY) -m mmgsd.report.reproduce quick
+	$(PY) -m mmgsd reproduce quick
 
 smoke: $(STAMP) ## The same with the preset smoke: every stage, tiny
-	$(PY) -m mmgsd.report.reproduce smoke
+	$(PY) -m mmgsd reproduce smoke
 
 test: lint unit notebooks-test ## Every check: lint, unit and notebooks-test
 
@@ -65,8 +65,8 @@ figures: $(STAMP) ## Draw the paper's figures of PRESET (paper) again from data/
 	$(PAPERMILL) notebooks/07_figures.ipynb data/generated/figures_$(PRESET).ipynb -p preset $(PRESET) -p run True
 
 readme: $(STAMP) ## Put the numbers of data/results into README.md, the results page and docs/claims.md; make docs/api.md
-	$(PY) -m mmgsd.report.tables data/results README.md data/results/README.md docs/claims.md
-	$(PY) -m mmgsd.extras.interface docs/api.md
+	$(PY) -m mmgsd tables data/results README.md data/results/README.md docs/claims.md
+	$(PY) -m mmgsd interface docs/api.md
 
 # Its tools are no part of the environment: only who builds the site needs them.
 docs: $(STAMP) ## Build the pages and the reference as a site in data/generated/docs; a dead link fails
@@ -77,17 +77,17 @@ docs: $(STAMP) ## Build the pages and the reference as a site in data/generated/
 	@echo "data/generated/docs/index.html"
 
 data-sample: $(STAMP) ## Copy 24 images of each object of PRESET into data/sample
-	$(PY) -m mmgsd.extras.sampling $(PRESET)
+	$(PY) -m mmgsd write-sample $(PRESET)
 
 weights: $(STAMP) ## Put the models of PRESET into data/weights, in half precision and with a card each
-	$(PY) -m mmgsd.extras.shipping $(PRESET)
+	$(PY) -m mmgsd ship $(PRESET)
 
 # Not committed: numbers, tables and verdicts are made anew from data/results/PRESET.
 paper: $(STAMP) ## Make the replication report paper/report.pdf from the results of PRESET; needs LaTeX
 	@command -v latexmk > /dev/null || { \
 		echo "make paper needs latexmk and LaTeX: on Debian, apt-get install latexmk texlive-latex-base texlive-latex-extra" \
 			"texlive-publishers texlive-science texlive-fonts-recommended." >&2; exit 1; }
-	$(PY) -m mmgsd.report.latex $(PRESET)
+	$(PY) -m mmgsd latex $(PRESET)
 	cd paper && latexmk -pdf -interaction=nonstopmode -halt-on-error report.tex
 
 lab: $(STAMP) ## Open the notebooks in JupyterLab

@@ -6,6 +6,7 @@ import dataclasses
 import difflib
 import math
 import numbers
+from collections.abc import Collection
 from typing import Any
 
 
@@ -15,11 +16,15 @@ def check(name: str, value: Any, accepted: str, ok: bool) -> None:
         raise ValueError(f"{name} must be {accepted}, got {value!r}")
 
 
-def check_choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
-    """ValueError that names the argument and the choices, the nearest one too, where ``value`` is none of them."""
+def describe_choices(value: Any, choices: Collection[str]) -> str:
+    """The choices, and which of them is the nearest to a value: "one of 'a', 'b' (did you mean 'a'?)"."""
     close = difflib.get_close_matches(str(value), choices, n=1)
-    hint = f" (did you mean {close[0]!r}?)" if close else ""
-    check(name, value, f"one of {', '.join(map(repr, choices))}{hint}", value in choices)
+    return f"one of {', '.join(map(repr, choices))}" + (f" (did you mean {close[0]!r}?)" if close else "")
+
+
+def check_choice(name: str, value: Any, choices: Collection[str]) -> None:
+    """ValueError that names the argument and the choices, the nearest one too, where ``value`` is none of them."""
+    check(name, value, describe_choices(value, choices), value in choices)
 
 
 FLAGS = {"true": True, "yes": True, "on": True, "1": True, "false": False, "no": False, "off": False, "0": False}

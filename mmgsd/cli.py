@@ -1,26 +1,32 @@
-"""What the commands of ``python -m mmgsd`` do, a function a command; their words are in `mmgsd.__main__`."""
+"""What answers from a shell: the commands of ``python -m mmgsd`` that ask weights, a function each."""
 
 from __future__ import annotations
 
 import argparse
-import csv
 import itertools
-import json
+import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, nullcontext
+from csv import DictWriter
+from json import dumps
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
+from tqdm import tqdm
 
 import mmgsd
+from mmgsd.command import Option, describe_error
+from mmgsd.config import MAX_MODES, OBJECTS
 from mmgsd.files import write_bytes, writing
 from mmgsd.images import check_pixels, list_images, read_mask
+from mmgsd.match.camera import read_intrinsics
 from mmgsd.match.describe import describe_answer, format_query
 from mmgsd.match.match import LIKELY
 
+PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
 DPI = 150  # of a picture
 NAMED = 10  # of what is left out of a folder
 COLUMNS = (
@@ -29,143 +35,350 @@ COLUMNS = (
 )  # fmt: skip
 
 
-def say_error(error: BaseException) -> str:
-    """An error in one line."""
-    return " ".join(str(error).split()) or type(error).__name__
+def parse_image(text: str) -> Path:
+    """The path of an image, - for what is piped in."""
+    return Path("/dev/stdin" if text == "-" else text)
 
 
-def match(args: argparse.Namespace) -> None:
-    """Answer for one image, or for each of a folder."""
-    if args.image1.is_dir():
-        _match_folder(args)
-        return
-    _check_written(args, [args.image1])
-    if args.pictures:
-        raise ValueError(f"--pictures must be given with a folder as image1, got {args.image1}: use --out")
-    images = [mmgsd.read_image(path) for path in (args.image0, args.image1)]
-    files = {"mask0": args.mask0, "mask1": args.mask1}
-    masks = {k: f and read_mask(f, im.shape[:2]) for (k, f), im in zip(files.items(), images, strict=True)}
-    answer = mmgsd.load(args.weights).match(*images, args.xy, n=args.n, joint=args.joint, **masks)
-    answer = answer.seen_first() if args.seen_first else answer
-    described = describe_answer(answer)
-    if args.out:
-        draw_answer(answer, args.out)
-    if args.csv:
-        with _writing_rows(args.csv) as table:
-            table.writerows(_list_rows(args.image1.name, described))
-    print(json.dumps(described) if args.json else "\n".join(map(format_query, described)), flush=True)
+def parse_pixel(text: str) -> tuple[float, float]:
+    """(column, row)."""
+    parts = text.split(",")
+    if len(parts) != 2:
+        raise argparse.ArgumentTypeError(f"must be column,row such as 212,148, got {text!r}")
+    try:
+        return float(parts[0]), float(parts[1])
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"must be two numbers such as 212,148, got {text!r}") from error
 
 
-def find(args: argparse.Namespace) -> None:
-    """Answer where places of the object are in an image."""
-    image = mmgsd.read_image(args.image)
-    mask = args.mask and read_mask(args.mask, image.shape[:2])
-    answer = mmgsd.load(args.weights).find(image, args.places, joint=args.joint, mask=mask)
-    answer = answer.seen_first() if args.seen_first else answer
-    described = [{"place": place, **query} for place, query in zip(args.places, describe_answer(answer), strict=True)]
-    if args.out:
-        draw_answer(answer, args.out)
-    lines = (f"{_name_place(query['place'])} -> {format_query(query).partition(' -> ')[2]}" for query in described)
-    print(json.dumps(described) if args.json else "\n".join(lines), flush=True)
+def parse_place(text: str) -> Any:
+    """A name, the number of a point, a fraction, or two of these."""
+    if re.fullmatch(r"[A-Za-z_]+", text):
+        return text
+    try:
+        parts = tuple(map(float, text.split(",")))
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"must be a name, a number or U,V, got {text!r}") from error
+    return int(text) if text.isdecimal() else parts[0] if len(parts) == 1 else parts
 
 
-def _name_place(place: Any) -> str:
-    return ",".join(f"{value:g}" for value in place) if isinstance(place, tuple) else f"{place}"
+def parse_picture(text: str) -> Path:
+    """The path of a picture to draw."""
+    if Path(text).suffix.lower() not in PICTURES:
+        raise argparse.ArgumentTypeError(f"must end with .png, .jpg, .pdf or .svg, got {text!r}")
+    return Path(text)
 
 
-def _match_folder(args: argparse.Namespace) -> None:
-    """Answer for one image after the other; RuntimeError at the end where some could not be answered for."""
-    if args.out or args.mask0 or args.mask1:
-        raise ValueError(f"--out, --mask0 and --mask1 must be given with one image1, got the folder {args.image1}: "
+def parse_intrinsics(text: str) -> np.ndarray:
+    """The camera's matrix."""
+    try:
+        return read_intrinsics([float(number) for number in text.split(",")])
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"must be FX,FY,CX,CY, or nine numbers: {error}") from error
+
+
+def parse_number(text: str) -> int | str:
+    """A number of modes, or auto."""
+    if text == "auto" or (text.isdecimal() and len(text) < 4 and 1 <= int(text) <= MAX_MODES):
+        return text if text == "auto" else int(text)
+    raise argparse.ArgumentTypeError(f"must be a number from 1 to {MAX_MODES}, or auto, got {text!r}")
+
+
+Weights = Annotated[str, Option("a trained model (safetensors), or a name in data/weights, like cloth", metavar="FILE")]
+Trained = Annotated[Path, Option("a trained model (safetensors)")]
+Image = Annotated[Path, Option(type=parse_image)]
+Mask = Annotated[Path, Option(type=parse_image, metavar="FILE")]
+Picture = Annotated[Path, Option("draw the answer (png, jpg, pdf or svg)", type=parse_picture, metavar="FILE")]
+Printed = Annotated[bool, Option("print the answer as JSON")]
+Folder = Annotated[Path, Option(metavar="FOLDER")]
+
+
+def match(
+    image0: Annotated[Image, Option("the image that the pixels are in, - for what is piped in")],
+    image1: Annotated[Image, Option("the image to find them in, or a folder of such images")],
+    *,
+    xy: Annotated[list, Option("column,row px in image0, the top left one is 0,0; may be given several times",
+                               type=parse_pixel, action="append", metavar="X,Y")],
+    weights: Weights,
+    n: Annotated[Any, Option("modes, or auto (default: its symmetry's)", type=parse_number, metavar="N")] = None,
+    joint: Annotated[bool, Option("answer all pixels together: the modes of one number belong together")] = False,
+    seen_first: Annotated[bool, Option("list matches that are seen before hidden ones")] = False,
+    mask0: Annotated[Mask, Option("an image as large as image0, brighter than half on the object")] | None = None,
+    mask1: Annotated[Mask, Option("an image as large as image1, brighter than half on the object")] | None = None,
+    out: Picture | None = None,
+    pictures: Annotated[Folder, Option("draw the answer of each image of a folder")] | None = None,
+    csv: Annotated[Path, Option("write a table, a row a mode", metavar="FILE")] | None = None,
+    json: Annotated[bool, Option("print the answer as JSON, of a folder a line an image")] = False,
+) -> None:  # fmt: skip
+    """Find all matches of pixels of an image in another, or in each of a folder; those that cannot be read are named.
+
+    example: %(prog)s towel1.jpg towel2.jpg --xy 212,148 --weights FILE --out match.png
+    """
+    many = image1.is_dir()
+    if many and (out or mask0 or mask1):
+        raise ValueError(f"--out, --mask0 and --mask1 must be given with one image1, got the folder {image1}: "
                          "use --pictures")  # fmt: skip
-    from tqdm import tqdm
-
-    paths, image0 = list_images(args.image1), mmgsd.read_image(args.image0)
-    _check_written(args, paths)
-    check_pixels(args.xy, image0.shape[1::-1])
-    matcher, failed = mmgsd.load(args.weights), []
-    matcher.compute_input_size(image0, "image0")
-    bar = tqdm(paths, desc="match", unit="image", disable=not sys.stderr.isatty())
-    _say_left_out(args.image1, paths)
-    named, frames = itertools.tee(_read_readable(matcher, bar, failed))
-    answers = matcher.match_many(((image0, image1, args.xy) for _, image1 in frames), n=args.n, joint=args.joint)
+    if pictures and not many:
+        raise ValueError(f"--pictures must be given with a folder as image1, got {image1}: use --out")
+    _check_order(joint, seen_first)
+    paths = list_images(image1) if many else [image1]
+    _check_written([path for path in (image0, mask0, mask1, *paths) if path], out=out, csv=csv, pictures=pictures)
+    _check_drawn(xy, "--out" if out else "--pictures" if pictures else "")
+    reference, failed = mmgsd.read_image(image0), []
+    check_pixels(xy, reference.shape[1::-1])
+    seen = None if mask0 is None else read_mask(mask0, reference.shape[:2])
+    matcher = mmgsd.load(weights)
+    matcher.compute_input_size(reference, "image0")
+    if many:
+        _say_left_out(image1, paths)
+    named, frames = itertools.tee(_read_readable(matcher, paths, failed) if many else _read_one(image1, mask1))
+    answers = matcher.match_many(((reference, image, xy, seen, mask) for _, image, mask in frames), n=n, joint=joint)
     plain = len({path.stem.casefold() for path in paths}) == len(paths)  # a.png and a.jpg are two pictures
-    with _writing_rows(args.csv) if args.csv else nullcontext() as table:
-        for (path, _), answer in zip(named, answers, strict=True):
-            answer = answer.seen_first() if args.seen_first else answer
+    with _writing_rows(csv) if csv else nullcontext() as table:
+        for (path, *_), answer in zip(named, answers, strict=True):
+            answer = answer.seen_first() if seen_first else answer
             described = describe_answer(answer)
             if table:
                 table.writerows(_list_rows(path.name, described))
-            if args.pictures:
-                draw_answer(answer, args.pictures / f"{path.stem if plain else path.name}.png")
-            with tqdm.external_write_mode():
-                _print_answer(path.name, described, as_json=args.json)
+            if out or pictures:
+                draw_answer(answer, out or pictures / f"{path.stem if plain else path.name}.png")
+            if many:
+                with tqdm.external_write_mode():
+                    _print_answer(path.name, described, as_json=json)
+    if not many:  # once the table is written, which may be to the same terminal
+        _print_answer("", described, as_json=json)
     if failed:
         raise RuntimeError(f"{len(failed)} of {len(paths)} images could not be answered for: {', '.join(failed)}")
 
 
-def _say_left_out(folder: Path, paths: list[Path]) -> None:
-    names = [path.name for path in sorted({*folder.iterdir()}.difference(paths)) if not path.name.startswith(".")]
-    if names:
-        more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
-        print(f"left out, as they do not end as images do: {', '.join(names[:NAMED])}{more}", file=sys.stderr)
+def find(
+    image: Annotated[Image, Option("the image to find them in")],
+    *places: Annotated[Any, Option("corners, edges, centre or U,V in [0, 1] of a cloth; ends, middle or a fraction "
+                                   "such as 0.25 of a rope; of any object the number of a material point",
+                                   type=parse_place, metavar="PLACE")],
+    weights: Weights,
+    joint: Annotated[bool, Option("answer all places together")] = False,
+    seen_first: Annotated[bool, Option("list places that are seen before hidden ones")] = False,
+    mask: Annotated[Mask, Option("brighter than half on the object")] | None = None,
+    out: Picture | None = None,
+    json: Printed = False,
+) -> None:  # fmt: skip
+    """Find places of the object by name, without a first image."""
+    _check_order(joint, seen_first)
+    shown = mmgsd.read_image(image)
+    answer = mmgsd.load(weights).find(shown, places, joint=joint, mask=mask and read_mask(mask, shown.shape[:2]))
+    answer = answer.seen_first() if seen_first else answer
+    described = [{"place": place, **query} for place, query in zip(places, describe_answer(answer), strict=True)]
+    if out:
+        draw_answer(answer, out)
+    lines = (f"{_name_place(query['place'])} -> {format_query(query).partition(' -> ')[2]}" for query in described)
+    print(dumps(described) if json else "\n".join(lines), flush=True)
 
 
-def _read_readable(matcher: Any, paths: Any, failed: list[str]) -> Iterator[tuple[Path, Any]]:
-    """(path, image) of the files that can be answered for; why others cannot is said, ``failed`` takes their names."""
-    for path in paths:
+def track(
+    video: Annotated[Path, Option("a video, an animated GIF or WebP, or a folder of frames")],
+    *,
+    xy: Annotated[list, Option("column,row px in the first frame; may be given several times", type=parse_pixel,
+                               action="append", metavar="X,Y")] = None,
+    find: Annotated[list, Option("instead, places as the command find takes them, such as corners", type=parse_place,
+                                 action="append", metavar="PLACE")] = None,
+    weights: Weights,
+    mask0: Annotated[Mask, Option("brighter than half on the first frame's object")] | None = None,
+    out: Annotated[Path, Option("what to write: .csv, .json, .mp4, .webm or .avi, or a folder for several",
+                                metavar="PLACE")],
+) -> None:  # fmt: skip
+    """Follow points through a video; what is interrupted keeps the frames that were finished."""
+    if bool(xy) == bool(find):
+        raise ValueError(f"one of --xy and --find must be given, got {'both' if xy else 'neither'}")
+    from mmgsd.match.recording import list_outputs, recording
+    from mmgsd.progress import ProgressBar
+    from mmgsd.video import open_video
+
+    shown, outputs = open_video(video), list_outputs(out)
+    if video.resolve() in (path.resolve() for path in outputs):
+        raise ValueError(f"--out must not be the video itself, got {out}")
+    images, frames = itertools.tee(shown)
+    seen = mask0 and read_mask(mask0, next(iter(shown)).shape[:2])
+    followed = mmgsd.load(weights).follow(frames, xy, find=find, mask0=seen)
+    absent, stopped = [], None
+    written = " and ".join(map(str, outputs))
+    with recording(outputs, shown.rate) as record:
         try:
-            image = mmgsd.read_image(path)
-            matcher.compute_input_size(image, str(path))
-        except (ValueError, OSError) as error:
-            failed.append(path.name)
-            paths.write(f"skipped: {say_error(error)}", file=sys.stderr)
-        else:
-            yield path, image
+            for one in ProgressBar(followed, desc="track", unit="frame", total=shown.count):
+                record(next(images), one)
+                absent.append(one.absent > LIKELY)
+        except (Exception, KeyboardInterrupt) as error:
+            if not absent:
+                raise
+            stopped = error
+    if isinstance(stopped, KeyboardInterrupt):
+        raise KeyboardInterrupt(f"{written} hold the first {len(absent)} frames")
+    print(f"{written}: {len(absent)} frames, the object is not seen in {sum(absent)} of them", flush=True)
+    if stopped:
+        raise stopped
+    if all(absent):
+        raise RuntimeError(f"none of the frames shows the object that {weights} knows")
 
 
-def _print_answer(name: str, described: list[dict[str, Any]], *, as_json: bool) -> None:
-    if as_json:
-        print(json.dumps({"image1": name, "queries": described}), flush=True)
-    else:
-        print("\n".join(f"{name} {format_query(query)}" for query in described), flush=True)
+def segment(
+    image: Annotated[Image, Option("the image to look at")],
+    *,
+    out: Annotated[Path, Option("the mask to write, .png: brighter than half on the object", metavar="FILE")],
+    weights: Weights,
+) -> None:
+    """Write where an image shows the object: a grey PNG, white where that is certain."""
+    if out.suffix.lower() != ".png":
+        raise ValueError(f"--out must end with .png, got {out}")
+    _check_written([image], out=out)
+    mask = mmgsd.load(weights).segment(mmgsd.read_image(image))
+    grey = np.rint(255 * mask).astype(np.uint8)
+    write_bytes(out, cv2.imencode(".png", grey)[1].tobytes())
+    print(f"{out}: brighter than half on the object, {np.mean(mask > 0.5):.0%} of the image")
 
 
-def _list_rows(name: str, described: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
-    """A row a mode, its pixels as x1, y1."""
-    for query in described:
-        shared = {key: value for key, value in query.items() if key not in ("xy", "modes")}
-        shared |= {"image1": name, **dict(zip("xy", query["xy"], strict=True))}
-        for k, mode in enumerate(query["modes"]):
-            x1, y1 = mode["xy"]
-            told = {name: value for name, value in mode.items() if name not in ("xy", "answer")}
-            yield {**shared, "mode": mode.get("answer", k + 1), "x1": x1, "y1": y1, **told}
+def measure(
+    place: Annotated[Folder, Option("with index.json, or such a file; its format: mmgsd/measure/photographs.py")],
+    *,
+    weights: Weights = "cloth",
+    out: Annotated[Picture, Option("draw an answer about each photograph")] | None = None,
+    store: Annotated[str, Option("write the numbers to data/results/photographs_NAME.json", metavar="NAME")] = "",
+    json: Annotated[bool, Option("print the numbers as JSON")] = False,
+) -> None:
+    """Measure on photographs with marked corners or ends."""
+    from mmgsd.measure.photographs import check_name, make_photographs_table, measure_photographs, store_photographs
+
+    if store:
+        check_name(store)
+    if out and out.exists() and out.resolve().is_relative_to(place.resolve()):
+        raise ValueError(f"--out must not replace a file among the photographs, got {out}")
+    from mmgsd.figures.photographs import ContactSheet  # last: its hint would name the extra of pictures alone
+
+    sheet = ContactSheet()
+    looking = {"seen": sheet.add} if out else {}
+    results = measure_photographs(weights, place, progress=sys.stderr.isatty(), **looking)
+    if out:
+        save_picture(sheet.plot(), out)
+    if store:
+        store_photographs(results, store)
+    print(dumps(results) if json else make_photographs_table(results), flush=True)
 
 
-@contextmanager
-def _writing_rows(path: Path) -> Iterator[csv.DictWriter]:
-    """A writer of `COLUMNS` to a file that appears whole or not at all."""
-    with writing(path) as aside, open(aside, "w", newline="", encoding="utf-8", errors="backslashreplace") as file:
-        table = csv.DictWriter(file, COLUMNS, restval="")
-        table.writeheader()
-        yield table
+def adapt(
+    folder: Annotated[Folder, Option("photographs, with marks in an index.json as measure reads it, or such a file")],
+    *,
+    weights: Weights = "cloth",
+    out: Annotated[Path, Option("the weights to write (safetensors)", metavar="FILE")],
+    renders: Annotated[Folder, Option("a data set of the object: it keeps what is known (default: the sample)")]
+    | None = None,
+    overwrite: Annotated[bool, Option("replace weights that were made of anything else")] = False,
+) -> None:
+    """Go on from weights with photographs, and print the card of what that did."""
+    written = mmgsd.adapt(folder, weights, out, renders=renders, overwrite=overwrite)
+    print(written.with_suffix(".md").read_text("utf-8"), end="")
 
 
-def _check_written(args: argparse.Namespace, paths: list[Path]) -> None:
-    """ValueError for a result that would replace an image, or a picture of more queries than a page holds."""
-    read = {path.resolve() for path in (args.image0, args.mask0, args.mask1, *paths) if path}
-    for name in ("out", "csv"):
-        place = getattr(args, name)
-        if place and place.resolve() in read:
-            raise ValueError(f"--{name} must not be one of the images, got {place}")
-    if args.pictures and args.pictures.resolve() in {path.parent for path in read}:
-        raise ValueError(f"--pictures must not be a folder of the images, got {args.pictures}")
-    if args.out or args.pictures:
-        from mmgsd.figures.plots import PAGE_QUERIES
+def fold(
+    demonstration: Annotated[Path, Option("see docs/folding.md", metavar="DEMO.json")],
+    image: Annotated[Image, Option("a picture of the present state")],
+    *,
+    weights: Weights,
+    look: Annotated[int, Option("which of the demonstration's looks (default: 0, the first)")] = 0,
+    chosen: Annotated[str, Option("which like modes are taken: those that one motion agrees with (the default), each "
+                                  "pixel's surest, or the surest that belong together",
+                                  choices=("agree", "best", "joint"))] = "agree",
+    intrinsics: Annotated[Any, Option("px, or the nine numbers of the matrix; prints rays too", type=parse_intrinsics,
+                                      metavar="FX,FY,CX,CY")] = None,
+    out: Annotated[Picture, Option("draw the moves (png, jpg, pdf or svg)")] | None = None,
+    json: Printed = False,
+) -> None:  # fmt: skip
+    """Say where to pick and place in a picture, as a demonstration did."""
+    from mmgsd.fold.demonstration import read_demonstration
+    from mmgsd.fold.moves import answer_picture
+    from mmgsd.match.camera import compute_rays
 
-        if len(args.xy) > PAGE_QUERIES:
-            option = "--out" if args.out else "--pictures"
-            raise ValueError(f"--xy must be given at most {PAGE_QUERIES} times with {option}, got {len(args.xy)}")
+    shown, now = read_demonstration(demonstration), mmgsd.read_image(image)
+    _check_written([image], out=out)
+    answer = answer_picture(mmgsd.load(weights), shown, now, look=look, chosen=chosen)
+    if out:
+        draw_moves(shown.looks[look], now, answer.moves, out)
+    told = {"pick": answer.moves[:, 0].round(1), "place": answer.moves[:, 1].round(1)}
+    if intrinsics is not None:
+        rays = compute_rays(answer.moves, intrinsics).round(5)
+        told |= {"pick_ray": rays[:, 0], "place_ray": rays[:, 1]}
+    moves = [{name: values[k].tolist() for name, values in told.items()} for k in range(len(answer.moves))]
+    if json:
+        print(dumps({"moves": moves, "agreement": round(answer.share, 3)}), flush=True)
+        return
+    for move in moves:
+        told = {name: ",".join(f"{number:g}" for number in numbers) for name, numbers in move.items()}
+        rays = f" (rays {told['pick_ray']} and {told['place_ray']})" if "pick_ray" in told else ""
+        print(f"pick {told['pick']} place {told['place']}{rays}")
+    print(f"{answer.share:.0%} of the demonstration's pixels agree", flush=True)
+
+
+def export(*, out: Annotated[Path, Option("the file to write, .onnx", metavar="FILE")], weights: Weights) -> None:
+    """Write a network as ONNX: image in, descriptors out."""
+    from mmgsd.extras.exporting import export_onnx
+
+    difference = export_onnx(mmgsd.load(weights), out)
+    print(f"{out}: images in, what Matcher.describe says of them out, the mean over quarter turns included; it "
+          f"differs from torch's single precision by {difference:.1e} at most, and from Matcher.describe, which takes "
+          "bfloat16 for some layers on a CPU, by up to 1e-2")  # fmt: skip
+
+
+def page(
+    out: Annotated[Path, Option("the folder to write; docs/page.md says how to host it", metavar="OUT")],
+    *,
+    weights: Weights = "cloth",
+    runtime: Annotated[Folder, Option("the npm package onnxruntime-web, unpacked; by default npm downloads it")]
+    | None = None,
+) -> None:
+    """Write a page that matches in a browser."""
+    from mmgsd.extras.page import make_page
+
+    folder = make_page(mmgsd.load(weights), out, name=Path(weights).stem, runtime=runtime)
+    size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+    print(f"{folder}: {size / 1e6:.0f} MB; to try it: python -m http.server --directory {folder}")
+
+
+def calibrate(
+    weights: Trained,
+    *,
+    data: Annotated[Folder, Option("the data set trained on")] | None = None,
+    unseen: Annotated[list[Path], Option("data sets whose test images were not trained on: by them how modes are read "
+                                         "is chosen, too", nargs="+", metavar="FOLDER")] | None = None,
+    overwrite: Annotated[bool, Option("fit it anew where the weights have it")] = False,
+) -> None:  # fmt: skip
+    """Fit what ellipses, radii and confidences promise, by either --data or --unseen, and keep it in the weights."""
+    if bool(data) == bool(unseen):
+        raise ValueError(f"one of --data and --unseen must be given, got {'both' if data else 'neither'}")
+    from mmgsd.measure.calibration import calibrate_unseen, calibrate_weights
+
+    calibrated = calibrate_weights if data else calibrate_unseen
+    matcher = mmgsd.load(calibrated(weights, data or unseen, overwrite=overwrite))
+    found, reading = matcher.calibration, matcher.reading
+    print(f"{weights}: modes read with power {reading.power:g} and sharpness {reading.sharpness:g}; "
+          f"calibrated on {found.pairs} pairs of held-out simulations; each half by the other: "
+          f"ECE {found.ece_ellipse:.3f} of ellipses, {found.ece_confidence:.3f} of confidences")  # fmt: skip
+
+
+def heads(
+    weights: Trained,
+    *,
+    data: Annotated[Folder, Option("the data set trained on")],
+    out: Annotated[Path, Option("the results to write (JSON)", metavar="FILE")],
+) -> None:
+    """Measure the masks, hidden matches and absence that weights tell beside their matches, and store it."""
+    from mmgsd.config import EvaluateConfig
+    from mmgsd.files import read_json
+    from mmgsd.measure.heads import evaluate_heads
+
+    print(dumps(read_json(evaluate_heads(weights, data, EvaluateConfig(pairs=100), out))))
+
+
+def samples(object: Annotated[str, Option(choices=OBJECTS)] = "cloth") -> None:
+    """Print the paths of two sample images of an object, a line each."""
+    print(*mmgsd.find_samples(object), sep="\n")
 
 
 def draw_answer(answer: Any, path: Path) -> None:
@@ -188,144 +401,83 @@ def save_picture(figure: Any, path: Path) -> None:
         figure.savefig(aside, format=path.suffix[1:].lower(), dpi=DPI, bbox_inches="tight", pad_inches=0.05)
 
 
-def track(args: argparse.Namespace) -> None:
-    """Follow points through a video; what is interrupted keeps the frames that were finished."""
-    from mmgsd.match.recording import list_outputs, recording
-    from mmgsd.progress import ProgressBar
-    from mmgsd.video import open_video
+def _check_order(joint: bool, seen_first: bool) -> None:
+    if joint and seen_first:
+        raise ValueError("--seen-first must not be given with --joint, which has an order of its own")
 
-    video, outputs = open_video(args.video), list_outputs(args.out)
-    if args.video.resolve() in (path.resolve() for path in outputs):
-        raise ValueError(f"--out must not be the video itself, got {args.out}")
-    images, frames = itertools.tee(video)
-    mask0 = args.mask0 and read_mask(args.mask0, next(iter(video)).shape[:2])
-    followed = mmgsd.load(args.weights).follow(frames, args.xy, find=args.find, mask0=mask0)
-    absent, stopped = [], None
-    written = " and ".join(map(str, outputs))
-    with recording(outputs, video.rate) as record:
+
+def _check_written(read: Iterable[Path], *, pictures: Path | None = None, **written: Path | None) -> None:
+    """ValueError for a result that would replace one of the images that are ``read``."""
+    images = {path.resolve() for path in read}
+    for name, path in written.items():
+        if path and path.resolve() in images:
+            raise ValueError(f"--{name} must not be one of the images, got {path}")
+    if pictures and pictures.resolve() in {path.parent for path in images}:
+        raise ValueError(f"--pictures must not be a folder of the images, got {pictures}")
+
+
+def _check_drawn(xy: list, how: str) -> None:
+    """ValueError for more queries than a page holds, where an option draws them."""
+    if how:
+        from mmgsd.figures.plots import PAGE_QUERIES
+
+        if len(xy) > PAGE_QUERIES:
+            raise ValueError(f"--xy must be given at most {PAGE_QUERIES} times with {how}, got {len(xy)}")
+
+
+def _say_left_out(folder: Path, paths: list[Path]) -> None:
+    names = [path.name for path in sorted({*folder.iterdir()}.difference(paths)) if not path.name.startswith(".")]
+    if names:
+        more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+        print(f"left out, as they do not end as images do: {', '.join(names[:NAMED])}{more}", file=sys.stderr)
+
+
+def _read_one(path: Path, mask: Path | None) -> Iterator[tuple[Path, np.ndarray, np.ndarray | None]]:
+    image = mmgsd.read_image(path)
+    yield path, image, None if mask is None else read_mask(mask, image.shape[:2])
+
+
+def _read_readable(matcher: Any, paths: list[Path], failed: list[str]) -> Iterator[tuple[Path, np.ndarray, None]]:
+    """(path, image, no mask) of files that can be answered for; why others cannot is said, ``failed`` names them."""
+    bar = tqdm(paths, desc="match", unit="image", disable=not sys.stderr.isatty())
+    for path in bar:
         try:
-            for one in ProgressBar(followed, desc="track", unit="frame", total=video.count):
-                record(next(images), one)
-                absent.append(one.absent > LIKELY)
-        except (Exception, KeyboardInterrupt) as error:
-            if not absent:
-                raise
-            stopped = error
-    if isinstance(stopped, KeyboardInterrupt):
-        raise KeyboardInterrupt(f"{written} hold the first {len(absent)} frames")
-    print(f"{written}: {len(absent)} frames, the object is not seen in {sum(absent)} of them", flush=True)
-    if stopped:
-        raise stopped
-    if all(absent):
-        raise RuntimeError(f"none of the frames shows the object that {args.weights} knows")
+            image = mmgsd.read_image(path)
+            matcher.compute_input_size(image, str(path))
+        except (ValueError, OSError) as error:
+            failed.append(path.name)
+            bar.write(f"skipped: {describe_error(error)}", file=sys.stderr)
+        else:
+            yield path, image, None
 
 
-def segment(args: argparse.Namespace) -> None:
-    """Write the probability of the object in each pixel as a grey PNG, white where it is certain."""
-    if args.out.suffix.lower() != ".png":
-        raise ValueError(f"--out must end with .png, got {args.out}")
-    if args.out.resolve() == args.image.resolve():
-        raise ValueError(f"--out must not be the image itself, got {args.out}")
-    mask = mmgsd.load(args.weights).segment(mmgsd.read_image(args.image))
-    grey = np.rint(255 * mask).astype(np.uint8)
-    write_bytes(args.out, cv2.imencode(".png", grey)[1].tobytes())
-    print(f"{args.out}: brighter than half on the object, {np.mean(mask > 0.5):.0%} of the image")
+def _print_answer(name: str, described: list[dict[str, Any]], *, as_json: bool) -> None:
+    """Of an image of a folder with its ``name``."""
+    if as_json:
+        print(dumps({"image1": name, "queries": described} if name else described), flush=True)
+    else:
+        print("\n".join(f"{name} {format_query(query)}".lstrip() for query in described), flush=True)
 
 
-def measure(args: argparse.Namespace) -> None:
-    """Measure on marked photographs: print a table or JSON, write a contact sheet and the results where asked for."""
-    from mmgsd.measure.photographs import check_name, make_photographs_table, measure_photographs, store_photographs
-
-    if args.store:
-        check_name(args.store)
-    if args.out and args.out.exists() and args.out.resolve().is_relative_to(args.place.resolve()):
-        raise ValueError(f"--out must not replace a file among the photographs, got {args.out}")
-    from mmgsd.figures.photographs import ContactSheet  # last: its hint would name the extra of pictures alone
-
-    sheet = ContactSheet()
-    looking = {"seen": sheet.add} if args.out else {}
-    results = measure_photographs(args.weights, args.place, progress=sys.stderr.isatty(), **looking)
-    if args.out:
-        save_picture(sheet.plot(), args.out)
-    if args.store:
-        store_photographs(results, args.store)
-    print(json.dumps(results) if args.json else make_photographs_table(results), flush=True)
+def _name_place(place: Any) -> str:
+    return ",".join(f"{value:g}" for value in place) if isinstance(place, tuple) else f"{place}"
 
 
-def adapt(args: argparse.Namespace) -> None:
-    """Go on from weights with photographs, and print the card of what that did."""
-    out = mmgsd.adapt(args.folder, args.weights, args.out, renders=args.renders, overwrite=args.overwrite)
-    print(out.with_suffix(".md").read_text("utf-8"), end="")
+def _list_rows(name: str, described: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
+    """A row a mode, its pixels as x1, y1."""
+    for query in described:
+        shared = {key: value for key, value in query.items() if key not in ("xy", "modes")}
+        shared |= {"image1": name, **dict(zip("xy", query["xy"], strict=True))}
+        for k, mode in enumerate(query["modes"]):
+            x1, y1 = mode["xy"]
+            told = {name: value for name, value in mode.items() if name not in ("xy", "answer")}
+            yield {**shared, "mode": mode.get("answer", k + 1), "x1": x1, "y1": y1, **told}
 
 
-def samples(args: argparse.Namespace) -> None:
-    """Print the paths of the sample images of an object, a line each."""
-    print(*mmgsd.find_samples(args.object), sep="\n")
-
-
-def export(args: argparse.Namespace) -> None:
-    """Write a network as ONNX."""
-    from mmgsd.extras.exporting import export_onnx
-
-    difference = export_onnx(mmgsd.load(args.weights), args.out)
-    print(f"{args.out}: images in, what Matcher.describe says of them out, the mean over quarter turns included; it "
-          f"differs from torch's single precision by {difference:.1e} at most, and from Matcher.describe, which takes "
-          "bfloat16 for some layers on a CPU, by up to 1e-2")  # fmt: skip
-
-
-def page(args: argparse.Namespace) -> None:
-    """Write a page that matches in a browser."""
-    from mmgsd.extras.page import make_page
-
-    folder = make_page(mmgsd.load(args.weights), args.out, name=Path(args.weights).stem, runtime=args.runtime)
-    size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
-    print(f"{folder}: {size / 1e6:.0f} MB; to try it: python -m http.server --directory {folder}")
-
-
-def calibrate(args: argparse.Namespace) -> None:
-    """Fit what ellipses, radii and confidences promise, and keep it in the file of weights."""
-    from mmgsd.measure.calibration import calibrate_unseen, calibrate_weights
-
-    calibrated = calibrate_weights if args.data else calibrate_unseen
-    matcher = mmgsd.load(calibrated(args.weights, args.data or args.unseen, overwrite=args.overwrite))
-    found, reading = matcher.calibration, matcher.reading
-    print(f"{args.weights}: modes read with power {reading.power:g} and sharpness {reading.sharpness:g}; "
-          f"calibrated on {found.pairs} pairs of held-out simulations; each half by the other: "
-          f"ECE {found.ece_ellipse:.3f} of ellipses, {found.ece_confidence:.3f} of confidences")  # fmt: skip
-
-
-def heads(args: argparse.Namespace) -> None:
-    """Measure what weights tell beside their matches, and store it."""
-    from mmgsd.config import EvaluateConfig
-    from mmgsd.files import read_json
-    from mmgsd.measure.heads import evaluate_heads
-
-    print(json.dumps(read_json(evaluate_heads(args.weights, args.data, EvaluateConfig(pairs=100), args.out))))
-
-
-def fold(args: argparse.Namespace) -> None:
-    """Say where to pick and place in a picture, as a demonstration did."""
-    from mmgsd.fold.demonstration import read_demonstration
-    from mmgsd.fold.moves import answer_picture
-    from mmgsd.match.camera import compute_rays
-
-    demonstration, image = read_demonstration(args.demonstration), mmgsd.read_image(args.image)
-    if args.out and args.out.resolve() == args.image.resolve():
-        raise ValueError(f"--out must not be the image itself, got {args.out}")
-    answer = answer_picture(mmgsd.load(args.weights), demonstration, image, look=args.look, chosen=args.chosen)
-    if args.out:
-        draw_moves(demonstration.looks[args.look], image, answer.moves, args.out)
-    moves = [{"pick": pick, "place": place} for pick, place in answer.moves.round(1).tolist()]
-    if args.intrinsics is not None:
-        rays = compute_rays(answer.moves, args.intrinsics).round(5).tolist()
-        moves = [
-            {**move, "pick_ray": pick, "place_ray": place} for move, (pick, place) in zip(moves, rays, strict=True)
-        ]
-    if args.json:
-        print(json.dumps({"moves": moves, "agreement": round(answer.share, 3)}), flush=True)
-        return
-    for move in moves:
-        told = {name: ",".join(f"{number:g}" for number in numbers) for name, numbers in move.items()}
-        rays = f" (rays {told['pick_ray']} and {told['place_ray']})" if "pick_ray" in told else ""
-        print(f"pick {told['pick']} place {told['place']}{rays}")
-    print(f"{answer.share:.0%} of the demonstration's pixels agree", flush=True)
+@contextmanager
+def _writing_rows(path: Path) -> Iterator[DictWriter]:
+    """A writer of `COLUMNS` to a file that appears whole or not at all."""
+    with writing(path) as aside, open(aside, "w", newline="", encoding="utf-8", errors="backslashreplace") as file:
+        table = DictWriter(file, COLUMNS, restval="")
+        table.writeheader()
+        yield table

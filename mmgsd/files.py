@@ -172,6 +172,15 @@ def set_aside(path: Path) -> Path:
     return target
 
 
+def is_kept(path: Path, is_wanted: Callable[[Path], Any]) -> bool:
+    """Whether a file is there and ``is_wanted``, which reads it; one that it finds damaged is set aside."""
+    try:
+        return path.is_file() and bool(is_wanted(path))
+    except DamagedFileError:
+        set_aside(path)
+        return False
+
+
 def remove_folder(folder: Path, is_ours: Callable[[Path], bool]) -> None:
     """Remove a folder of the project's files; a no-op where there is none.
 

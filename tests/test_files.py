@@ -234,3 +234,16 @@ def test_no_process_is_signalled_where_signal_0_is_ctrl_c(monkeypatch):
     monkeypatch.setattr(os, "kill", lambda *_: pytest.fail("sends Ctrl-C on Windows"))
     monkeypatch.setattr(os, "name", "nt")
     assert files._is_running("", 1)
+
+
+@pytest.mark.parametrize(("content", "kept", "left"), [
+    ('{"a": 1}', True, ["x.json"]), ('{"a": 2}', False, ["x.json"]), ("{", False, ["x.json.damaged"]),
+    (None, False, []),
+])  # fmt: skip
+@pytest.mark.filterwarnings("ignore:.*is damaged")
+def test_a_file_is_kept_where_it_is_what_is_wanted_and_set_aside_where_it_is_damaged(tmp_path, content, kept, left):
+    path = tmp_path / "x.json"
+    if content is not None:
+        path.write_text(content)
+    assert files.is_kept(path, lambda file: files.read_json(file) == {"a": 1}) is kept
+    assert os.listdir(tmp_path) == left

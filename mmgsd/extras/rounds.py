@@ -1,7 +1,7 @@
 """The shipped models' training, in rounds that a laptop's evening holds: each on new images, from the round before.
 
-    python -m mmgsd.extras.rounds cloth           every round that is missing, one after another
-    python -m mmgsd.extras.rounds cloth --last 2  up to the second
+    python -m mmgsd rounds cloth           every round that is missing, one after another
+    python -m mmgsd rounds cloth --last 2  up to the second
 
 A round renders its clean and its cluttered images, with seeds of its own, trains on them and leaves its weights as
 ``data/weights/cloth-round2.safetensors``, from which the next one goes on: of the rounds before nothing else is needed.
@@ -10,13 +10,12 @@ Its errors on simulations held out from it are kept in data/results/rounds.json.
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import pandas as pd
 
-from mmgsd.command import run_command
+from mmgsd.command import Option
 from mmgsd.config import OBJECTS, ROUNDS, load_preset
 from mmgsd.extras.shipping import ship_model
 from mmgsd.files import write_json
@@ -71,21 +70,17 @@ def _keep_curve(root: Path, object: str, number: int, weights: Path) -> None:
     write_json(file, {name: dict(sorted(rows[name].items())) for name in OBJECTS if name in rows})
 
 
-def main() -> None:
+def main(
+    object: Annotated[str, Option(choices=OBJECTS)],
+    *,
+    last: Annotated[int, Option("go on up to this round", choices=range(1, ROUNDS + 1))] = ROUNDS,
+    render_only: Annotated[bool, Option("render the next round's images and stop")] = False,
+    workers: Annotated[int, Option("processes that render (default: one a core)")] = 0,
+) -> None:
     """Run the rounds of an object that are missing."""
-    parser = argparse.ArgumentParser(prog="python -m mmgsd.extras.rounds", description=__doc__.split("\n")[0])
-    parser.add_argument("object", choices=OBJECTS)
-    parser.add_argument("--last", type=int, default=ROUNDS, choices=range(1, ROUNDS + 1), help="go on up to this round")
-    parser.add_argument("--render-only", action="store_true", help="render the next round's images and stop")
-    parser.add_argument("--workers", type=int, default=0, help="processes that render (default: one a core)")
-    args = parser.parse_args()
     root = find_root()
-    for number in range(find_round(root, args.object) + 1, args.last + 1):
-        if args.render_only:
-            print(render_round(root, args.object, number, workers=args.workers))
+    for number in range(find_round(root, object) + 1, last + 1):
+        if render_only:
+            print(render_round(root, object, number, workers=workers))
             return
-        print(run_round(root, args.object, number, workers=args.workers))
-
-
-if __name__ == "__main__":
-    run_command(main)
+        print(run_round(root, object, number, workers=workers))

@@ -2,25 +2,25 @@
 
 Images are WebP at a quality where the eye sees no difference, and labels are rounded to 1/16 px.
 
-    python -m mmgsd.extras.sampling paper     24 images of each object -> data/sample/cloth; of any other preset
-                                              -> data/sample/workspace/cloth
+    python -m mmgsd write-sample paper     24 images of each object -> data/sample/cloth; of any other preset
+                                           -> data/sample/workspace/cloth
 """
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import io
 import json
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from mmgsd.command import run_command
+from mmgsd.command import Option
 from mmgsd.config import OBJECTS, load_preset
 from mmgsd.dataset import Dataset, check_dataset, load_dataset
 from mmgsd.dataset_format import find_owner
@@ -92,21 +92,15 @@ def _read_quality(quality: int) -> int:
     return quality
 
 
-def main() -> None:
+def main(
+    preset: str = "paper", *, quality: Annotated[int, Option("of WebP, 1 to 100 (default: %(default)s)")] = QUALITY
+) -> None:
     """Sample both objects of a preset."""
-    parser = argparse.ArgumentParser(prog="python -m mmgsd.extras.sampling", description=__doc__.split("\n")[0])
-    parser.add_argument("preset", nargs="?", default="paper")
-    parser.add_argument("--quality", type=int, default=QUALITY, help="of WebP, 1 to 100 (default %(default)s)")
-    args = parser.parse_args()
-    load_preset(args.preset)
-    paths = Paths(find_root(), args.preset)
-    sample = paths.root / "data" / "sample" / ("" if args.preset == "paper" else args.preset)
+    load_preset(preset)
+    paths = Paths(find_root(), preset)
+    sample = paths.root / "data" / "sample" / ("" if preset == "paper" else preset)
     for name in OBJECTS:
-        print(f"{write_sample(paths.dataset(name), sample / name, quality=args.quality)}: checked")
+        print(f"{write_sample(paths.dataset(name), sample / name, quality=quality)}: checked")
     from mmgsd.measure.photographs import write_sample_marks  # needs torch, as nothing else here
 
     print(f"{write_sample_marks(sample)}: their corners and ends")
-
-
-if __name__ == "__main__":
-    run_command(main, kept="a finished sample is kept, an unfinished one is made anew by the same command")

@@ -1,21 +1,21 @@
 """Weights that go with the repository: half precision, each with a card that says what it is.
 
-python -m mmgsd.extras.shipping paper             data/generated/paper/models -> data/weights/cloth.safetensors, .md …
-python -m mmgsd.extras.shipping paper --restore      and back: evaluation and figures then need no training
+    python -m mmgsd ship paper              data/generated/paper/models -> data/weights/cloth.safetensors, .md …
+    python -m mmgsd ship paper --restore    and back: evaluation and figures then need no training
 """
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import json
 from pathlib import Path
+from typing import Annotated
 
 import torch
 
-from mmgsd.command import run_command
+from mmgsd.command import Option
 from mmgsd.config import OBJECTS, TrainConfig, load_preset
-from mmgsd.files import DamagedFileError, ForeignFileError, locked, set_aside, write_bytes, write_text
+from mmgsd.files import DamagedFileError, ForeignFileError, is_kept, locked, set_aside, write_bytes, write_text
 from mmgsd.measure.calibration import calibrate_weights
 from mmgsd.measure.evaluation import read_results
 from mmgsd.measure.shipped import SETS
@@ -115,20 +115,9 @@ def restore_model(shipped: Path, folder: Path, config: TrainConfig) -> Path:
         raise ValueError(f"{shipped} is {theirs.name}, and {config.name} was asked for: train that one")
     weights = folder / WEIGHTS
     with locked(folder, "restoring"):
-        if not _is_whole(weights):
+        if not is_kept(weights, read_tensors):  # whole ones, whatever they hold, are kept
             write_bytes(weights, shipped.read_bytes())
     return weights
-
-
-def _is_whole(weights: Path) -> bool:
-    """Whether there are weights; damaged ones are set aside."""
-    if not weights.is_file():
-        return False
-    try:
-        read_tensors(weights)
-    except DamagedFileError:
-        set_aside(weights)
-    return weights.is_file()
 
 
 def _holds(file: Path, state: dict[str, torch.Tensor], note: dict[str, str]) -> bool:
@@ -140,16 +129,17 @@ def _holds(file: Path, state: dict[str, torch.Tensor], note: dict[str, str]) -> 
     )
 
 
-def main() -> None:
+@torch.no_grad()
+def main(
+    preset: str = "paper",
+    *,
+    restore: Annotated[bool, Option("shipped models to where training would leave them")] = False,
+) -> None:
     """Ship the models of a preset, those that are trained and evaluated; or take the shipped ones for trained."""
-    parser = argparse.ArgumentParser(prog="python -m mmgsd.extras.shipping", description=__doc__.split("\n")[0])
-    parser.add_argument("preset", nargs="?", default="paper")
-    parser.add_argument("--restore", action="store_true", help="shipped models to where training would leave them")
-    args = parser.parse_args()
-    config, paths = load_preset(args.preset), Paths(find_root(), args.preset)
+    config, paths = load_preset(preset), Paths(find_root(), preset)
     models = {(name, method): configure_model(config, name, method) for name in OBJECTS for method in SHIPPED}
     shipped = {key: paths.root / "data" / "weights" / f"{key[0]}{SHIPPED[key[1]]}.safetensors" for key in models}
-    if args.restore:
+    if restore:
         for key, file in shipped.items():
             if file.is_file():
                 print(restore_model(file, paths.model(models[key]), models[key]))
@@ -162,7 +152,7 @@ def main() -> None:
             continue
         if paths.dataset(name).is_dir():  # elsewhere trained weights are shipped as they came
             calibrate_weights(weights, paths.dataset(name))
-        facts = {"preset": args.preset, "data_seed": config.render[name].seed, "measured": measured}
+        facts = {"preset": preset, "data_seed": config.render[name].seed, "measured": measured}
         print(ship_model(weights, shipped[name, method], facts))
 
 
@@ -173,8 +163,3 @@ def _find_measured(paths: Paths, object: str, method: str) -> dict[str, dict]:
         return {name: row[name] for name in (*SETS, "photographs") if name in row}
     row = read_results(paths.results / "rmse.json", depth=2).get(object, {}).get(method)
     return {paths.preset: row} if row else {}
-
-
-if __name__ == "__main__":
-    torch.set_grad_enabled(False)
-    run_command(main)

@@ -10,6 +10,7 @@ import hashlib
 import json
 import tempfile
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from dask.distributed import Client
 
 from mmgsd.checks import check, check_choice, read_count, read_flag
 from mmgsd.cluster import run_tasks
-from mmgsd.files import DamagedFileError, scratch_folder, set_aside, write_bytes
+from mmgsd.files import is_kept, scratch_folder, write_bytes
 from mmgsd.fold.state import State, read_state
 from mmgsd.fold.tasks import GROUNDS, MOTIONS, STARTS, Move, Task, find_task, place_truth
 from mmgsd.progress import ProgressBar
@@ -125,22 +126,15 @@ def run_jobs(
     """
     folder, workers, progress = Path(folder), read_count("workers", workers), read_flag("progress", progress)
     files = {name: folder / f"{name}.npz" for name in jobs}
-    missing = {name: job for name, job in jobs.items() if not _is_whole(files[name], job)}
+    missing = {name: job for name, job in jobs.items() if not is_kept(files[name], partial(_is_of, job))}
     if missing:
         with connect(workers, scheduler) as client:
             _run_missing(client, missing, files, progress)
     return files
 
 
-def _is_whole(path: Path, job: dict) -> bool:
-    """Whether a job's state is there; a damaged one is set aside, another job's will be replaced."""
-    if not path.is_file():
-        return False
-    try:
-        return read_state(path).about["mark"] == job["mark"]
-    except DamagedFileError:
-        set_aside(path)
-        return False
+def _is_of(job: dict, path: Path) -> bool:
+    return read_state(path).about["mark"] == job["mark"]
 
 
 def _run_missing(client: Client, jobs: dict[str, dict], files: dict[str, Path], progress: bool) -> None:

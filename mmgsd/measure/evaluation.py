@@ -15,7 +15,7 @@ from mmgsd.checks import read_count, read_flag
 from mmgsd.config import EvaluateConfig, digest
 from mmgsd.dataset import Dataset, load_dataset
 from mmgsd.dataset_format import UNREADABLE
-from mmgsd.files import DamagedFileError, read_json, saying_what_stays, set_aside, write_json, writing
+from mmgsd.files import DamagedFileError, is_kept, read_json, saying_what_stays, write_json, writing
 from mmgsd.match.baselines import BASELINES, OPTIONAL, BaselineMatcher
 from mmgsd.match.matcher import Matcher, check_scales, read_heatmap
 from mmgsd.match.mixture import AS_IT_IS, Mixture, Reading, check_modes
@@ -52,7 +52,7 @@ def evaluate_model(
     method += f" of {modes} modes" if modes else ""
     method += f" by {reading}" if reading else ""
     question = _describe_question(data, config, group, method)
-    if not overwrite and _is_answered(out, question):
+    if not overwrite and is_kept(out, lambda table: load_queries(table).attrs == question):
         return out
     matcher = Matcher.load(weights)
     if temperature is not None:
@@ -78,7 +78,7 @@ def evaluate_baseline(
     data = load_dataset(dataset, "test")
     asked = method if reading == AS_IT_IS else f"{method} by {reading}"
     question = _describe_question(data, config, group, asked)
-    if not overwrite and _is_answered(out, question):
+    if not overwrite and is_kept(out, lambda table: load_queries(table).attrs == question):
         return out
     answer = _chance_answer(method, data) if method in CHANCE else _classical_answer(method, data, reading)
     return _answer_all(answer, data, config, group, out, question, progress)
@@ -182,15 +182,6 @@ def _describe_question(data: Dataset, config: EvaluateConfig, group: str, method
     question = {"data": data.fingerprint, "config": digest(config), "group": data.group(group).name}
     labels = data.info.get("labels_sha256", "")  # they can be corrected without being rendered anew
     return {**question, "labels": labels, "method": method, "measures": MEASURES}
-
-
-def _is_answered(out: Path, question: dict[str, str]) -> bool:
-    """Whether a table answers the question; a damaged one is set aside."""
-    try:
-        return out.is_file() and load_queries(out).attrs == question
-    except DamagedFileError:
-        set_aside(out)
-        return False
 
 
 def _answer_all(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -14,8 +13,9 @@ import torch
 from mmgsd.checks import read_flag
 from mmgsd.config import EvaluateConfig, digest
 from mmgsd.dataset import Dataset, load_dataset
-from mmgsd.files import DamagedFileError, read_json, set_aside, write_json
+from mmgsd.files import is_kept, write_json
 from mmgsd.match.matcher import Matcher, read_heatmap
+from mmgsd.measure.evaluation import read_results
 from mmgsd.measure.metrics import assign_modes
 from mmgsd.measure.questions import choose_points, describe, draw_pairs
 from mmgsd.measure.uncertainty import compute_auroc
@@ -44,7 +44,7 @@ def evaluate_heads(
     matcher, data = Matcher.load(weights), load_dataset(dataset, "test")
     question = {"weights": hashlib.sha256(Path(weights).read_bytes()).hexdigest(), "data": data.fingerprint,
                 "labels": data.info.get("labels_sha256", ""), "config": digest(config)}  # fmt: skip
-    if not overwrite and _is_measured(out, question):
+    if not overwrite and is_kept(out, lambda path: read_results(path, depth=0).get("question") == question):
         return out
     measures = measure_heads(matcher, data, config, progress=progress)
     return write_json(out, {**measures, "heads": matcher.config.heads, "images": len(data), "question": question})
@@ -119,14 +119,3 @@ def _find_modes(
     heatmap = matcher.compute_heatmaps(said0, said1, xy, size)
     centres = compute_cell_centres(size, heatmap.shape[-2:])
     return read_heatmap(heatmap, n, centres, reading=matcher.reading)[0].modes
-
-
-def _is_measured(out: Path, question: dict[str, Any]) -> bool:
-    """Whether ``out`` answers the question; a damaged one is set aside."""
-    if not out.is_file():
-        return False
-    try:
-        return read_json(out).get("question") == question
-    except (DamagedFileError, AttributeError):
-        set_aside(out)
-        return False

@@ -1,6 +1,6 @@
 """Do the answers to several pixels belong together? Questions of three random points, answered jointly and one by one.
 
-    python -m mmgsd.measure.joint cloth rope            of shipped weights -> data/results/joint.json
+    python -m mmgsd run joint cloth rope    of shipped weights -> data/results/joint.json
 
 The test images of the presets `SETS` have to be rendered. A question is right where one member of the symmetry takes
 all its points to within `RADIUS_PX` of the chosen modes. Answers are chosen four ways: each point's heaviest mode; the
@@ -10,16 +10,15 @@ all joint answers, of which the share that is right counts.
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import statistics
 import time
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
-from mmgsd.command import run_command
+from mmgsd.command import Option
 from mmgsd.config import DEFAULT_GROUP, EvaluateConfig
 from mmgsd.dataset import Dataset, load_dataset
 from mmgsd.match.match import RADIUS_PX, Match
@@ -112,16 +111,10 @@ def summarise_questions(asked: list[dict[str, float]]) -> dict[str, float]:
     return said
 
 
-def main() -> None:
+def main(*names: Annotated[str, Option("of weights in data/weights, or files")]) -> None:
     """Measure shipped weights, a row each; rows of other names stay."""
-    parser = argparse.ArgumentParser(prog="python -m mmgsd.measure.joint", description=__doc__.split("\n")[0])
-    parser.add_argument("names", nargs="+", help="of weights in data/weights, or files")
-    names, root = parser.parse_args().names, find_root()
+    root = find_root()
     out = root / "data" / "results" / RESULTS
     for name in names:
         write_results(read_results(out) | {name: measure_joint(name, root)}, out)
     print(f"{out}: {', '.join(names)}")
-
-
-if __name__ == "__main__":
-    run_command(main, kept="rows of weights that are finished are kept")

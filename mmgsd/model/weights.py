@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from mmgsd.config import TrainConfig, from_dict
+from mmgsd.files import DamagedFileError
 from mmgsd.model.calibration import parse_calibration
 from mmgsd.model.network import build_network
+from mmgsd.model.tensors import read_tensors
 
 FORMAT = "mmgsd-1"
 PLACES = "places"  # beside the network's tensors: what its object's material points are described as
@@ -51,11 +52,9 @@ def read_weights(path: Path | str) -> Weights:
     path = Path(path)
     _check_file(path)
     try:
-        with safe_open(path, "pt") as file:
-            metadata = file.metadata() or {}
-            state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError) as error:
-        raise ValueError(_describe_damage(path, error)) from error
+        state, metadata = read_tensors(path)
+    except (DamagedFileError, FileNotFoundError) as error:  # the latter for a name that is no UTF-8
+        raise ValueError(_describe_damage(path, error.__cause__ or error)) from error
     if metadata.get("format") != FORMAT:
         raise ValueError(f"{path} holds no mmgsd weights: its metadata says format {metadata.get('format')!r}, "
                          f"not {FORMAT!r}")  # fmt: skip
@@ -80,7 +79,7 @@ def _check_file(path: Path) -> None:
     open(path, "rb").close()  # PermissionError names the file
 
 
-def _describe_damage(path: Path, error: Exception) -> str:
+def _describe_damage(path: Path, error: BaseException) -> str:
     """Why it is no safetensors file; asked only once it is known to be none, for one may begin with the same bytes."""
     if str(path).encode(errors="replace") != os.fsencode(path):
         return f"{path} must have a name in UTF-8, its folders' names, too: rename it"

@@ -1,20 +1,18 @@
 """The replication report's numbers, tables and verdicts, made from a preset's results: LaTeX for paper/report.tex.
 
-    python -m mmgsd.report.latex quick        data/results/quick -> paper/generated/results.tex, main_table.tex, …
+    python -m mmgsd latex quick        data/results/quick -> paper/generated/results.tex, main_table.tex, …
 
 A stage that was not run for the preset leaves no results file: its table then says so, and the report still builds.
 """
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from mmgsd.command import run_command
 from mmgsd.config import IMAGE_SIZE, load_preset
 from mmgsd.files import write_text
 from mmgsd.paths import Paths, find_root
@@ -137,13 +135,6 @@ def _join(cells: Sequence[str]) -> str:
     return " & ".join(map(set_text, cells)) + r" \\"
 
 
-def main() -> None:
-    """Write the numbers and tables of one preset."""
-    parser = argparse.ArgumentParser(prog="python -m mmgsd.report.latex", description=__doc__.split("\n")[0])
-    parser.add_argument("preset")
-    for path in write_report(parser.parse_args().preset, find_root()):
-        print(path)
-
-
-if __name__ == "__main__":
-    run_command(main)
+def main(preset: str) -> None:
+    """Write the numbers and tables of one preset, from which paper/report.tex is made."""
+    print(*write_report(preset, find_root()), sep="\n")

@@ -1,4 +1,4 @@
-"""The whole experiment of a preset, watched from a terminal: ``python -m mmgsd.report.reproduce quick``.
+"""The whole experiment of a preset, watched from a terminal: ``python -m mmgsd reproduce quick``.
 
 It is papermill that runs notebooks/run_all.ipynb; this says how far it is, ends all of it at a Ctrl-C, and gives the
 verdict.
@@ -6,7 +6,6 @@ verdict.
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import ctypes
 import os
@@ -19,11 +18,11 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Annotated, Any, TextIO
 
 import psutil
 
-from mmgsd.command import run_command
+from mmgsd.command import Option
 from mmgsd.config import PRESETS
 from mmgsd.paths import Paths, find_root
 from mmgsd.progress import TOLD
@@ -32,7 +31,6 @@ from mmgsd.report.stages import estimate_left, find_run, load_minutes, load_stat
 LOOK = 1.0  # s between two looks at how far it is
 SAY = 60.0  # s between two lines, where no line can be drawn over
 PATIENCE = 10.0  # s that processes have to end when asked
-KEPT = "finished stages, rendered batches and the last checkpoints are kept, and the same command goes on from there"
 
 
 def reproduce(preset: str, *, out: TextIO = sys.stdout) -> str:
@@ -166,17 +164,10 @@ def _say(minutes: float) -> str:
     return f"{hours} h {rest:02}" if hours else f"{rest} min"
 
 
-def main() -> None:
-    """Run a preset and print its verdict."""
-    parser = argparse.ArgumentParser(prog="python -m mmgsd.report.reproduce", description=__doc__.split("\n")[0])
-    parser.add_argument("preset", choices=tuple(PRESETS))
-    preset = parser.parse_args().preset
+def main(preset: Annotated[str, Option(choices=PRESETS)]) -> None:
+    """Run every stage of a preset and print its verdict."""
     for name in ("SIGTERM", "SIGHUP"):  # end everything as a Ctrl-C does, unless nohup has it go on
         if hasattr(signal, name) and signal.getsignal(getattr(signal, name)) == signal.SIG_DFL:
             signal.signal(getattr(signal, name), signal.default_int_handler)
     print(f"Every stage of the preset {preset}; Ctrl-C stops, and the same command goes on.", flush=True)
     print(reproduce(preset), end="")
-
-
-if __name__ == "__main__":
-    run_command(main, kept=KEPT)

@@ -1,13 +1,12 @@
-"""The tables of Markdown files, made from the results: ``python -m mmgsd.report.tables data/results README.md``."""
+"""The tables of Markdown files, made from the results: ``python -m mmgsd tables data/results README.md``."""
 
 from __future__ import annotations
 
-import argparse
 import re
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from mmgsd.command import run_command
+from mmgsd.command import Option
 from mmgsd.files import write_text
 from mmgsd.report.claims import describe_claims, make_findings
 from mmgsd.studies.registry import Shown, list_studies, load_results, read_table, told_where
@@ -53,15 +52,10 @@ def _read(results: Path, file: str | tuple[str, ...]) -> dict[str, Any]:
     return load_results(results / file) if (results / file).is_dir() else read_table(results / file)
 
 
-def main() -> None:
+def main(
+    results: Annotated[Path, Option("the folder of results, data/results")],
+    *documents: Annotated[Path, Option("Markdown files that mark tables")],
+) -> None:
     """Update the tables of some documents."""
-    parser = argparse.ArgumentParser(prog="python -m mmgsd.report.tables", description=__doc__)
-    parser.add_argument("results", type=Path, help="the folder of results, data/results")
-    parser.add_argument("documents", type=Path, nargs="+", help="Markdown files that mark tables")
-    args = parser.parse_args()
-    for document in args.documents:
-        update_tables(document, args.results)
-
-
-if __name__ == "__main__":
-    run_command(main)
+    for document in documents:
+        update_tables(document, results)

@@ -1,7 +1,7 @@
 """How many photographs of one's own does `mmgsd.adapt` need? Measured by repositories of photographs that others took.
 
-    python -m mmgsd.studies.adaptation FOLDER                   every cell -> data/results/adaptation.json
-    python -m mmgsd.studies.adaptation FOLDER --object cloth --counts 5 --splits 1 --steps 32     a few of them
+    python -m mmgsd run adaptation FOLDER                   every cell -> data/results/adaptation.json
+    python -m mmgsd run adaptation FOLDER --object cloth --counts 5 --splits 1 --steps 32     a few of them
 
 FOLDER holds photographs and an index.json with marks and the ``repo`` of each (`mmgsd.measure.photographs`). Of each
 repository that has enough, some are learnt from, with their marks or without; asked about are those of it that no count
@@ -11,20 +11,19 @@ away. What is measured is kept, so that a killed call goes on.
 
 from __future__ import annotations
 
-import argparse
 import json
 import tempfile
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
 from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 
-from mmgsd.command import run_command
+from mmgsd.command import Option
 from mmgsd.config import OBJECTS
 from mmgsd.figures.style import COLUMN_IN, check_filled, finish_axes, styled
 from mmgsd.files import write_json
@@ -175,19 +174,15 @@ def figure(results: Mapping[str, Any], *, by: str = "name") -> Figure:
     return finish_axes(figure)
 
 
-def main() -> None:
+def main(
+    folder: Annotated[Path, Option("marked photographs, with index.json", metavar="FOLDER")],
+    *,
+    object: Annotated[list, Option("one of them alone", choices=OBJECTS, action="append", type=str)] = None,
+    counts: Annotated[list[int], Option("of photographs adapted to", nargs="+", choices=COUNTS)] = COUNTS,
+    splits: Annotated[int, Option("of each repository's photographs")] = SPLITS,
+    steps: Annotated[int, Option("of each training")] = STEPS,
+    out: Annotated[Path, Option("another results file")] | None = None,
+) -> None:
     """Measure what is missing, and print the table."""
-    parser = argparse.ArgumentParser(prog="python -m mmgsd.studies.adaptation", description=__doc__.split("\n")[0])
-    parser.add_argument("folder", type=Path, metavar="FOLDER")
-    parser.add_argument("--object", choices=OBJECTS, action="append", help="one of them alone")
-    parser.add_argument("--counts", type=int, nargs="+", default=COUNTS, choices=COUNTS)
-    parser.add_argument("--splits", type=int, default=SPLITS)
-    parser.add_argument("--steps", type=int, default=STEPS)
-    parser.add_argument("--out", type=Path, help="another results file")
-    args = parser.parse_args()
-    how = {"counts": args.counts, "splits": args.splits, "steps": args.steps, "out": args.out}
-    print(table(json.loads(run(args.folder, objects=args.object or OBJECTS, **how).read_text("utf-8"))))
-
-
-if __name__ == "__main__":
-    run_command(main)
+    found = run(folder, objects=object or OBJECTS, counts=counts, splits=splits, steps=steps, out=out)
+    print(table(json.loads(found.read_text("utf-8"))))

@@ -1,17 +1,15 @@
 """Do the matches of neighbouring material points neighbour each other? MMGSD beside SPCL, both of clean images alone.
 
-python -m mmgsd.studies.continuity    the shipped weights about the sample -> data/results/paper/continuity.json
+    python -m mmgsd run continuity    the shipped weights about the sample -> data/results/paper/continuity.json
 """
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mmgsd.command import run_command
 from mmgsd.config import OBJECTS, EvaluateConfig
 from mmgsd.dataset import Dataset
 from mmgsd.files import write_json
@@ -74,7 +72,7 @@ def judge_continuous(results: Results) -> Claim:
         "continuous", "SPCL's answers are discontinuous; MMGSD's are more continuous.",
         "Fewer of MMGSD's matches jump from one material point to its neighbour; a part each object.",
         f"jumps, {'; '.join(shown)}; the sample's images, one seed", parts,
-        "`.venv/bin/python -m mmgsd.studies.continuity`", PAPER_SIZE,
+        "`.venv/bin/python -m mmgsd run continuity`", PAPER_SIZE,
     )  # fmt: skip
 
 
@@ -82,10 +80,5 @@ STUDY = Study("continuity", 40, run, results=("continuity",), claims=(judge_cont
 
 
 def main() -> None:
-    """Measure, for the preset that these weights are of."""
-    argparse.ArgumentParser(prog="python -m mmgsd.studies.continuity", description=__doc__).parse_args()
+    """Measure the shipped weights that learnt from the paper's images alone."""
     print(run(Paths(find_root(), "paper")))
-
-
-if __name__ == "__main__":
-    run_command(main)

@@ -63,7 +63,7 @@ def check(paths: Paths, *, method: str = "mmgsd", objects: Sequence[str] = OBJEC
     check_images(paths, objects)
     models = list_models(paths.preset, method, objects).values()
     files = [file for m in models for file in (paths.model(m) / WEIGHTS, paths.queries(m.name))]
-    check_made(paths, "03_train and 04_evaluate, or python -m mmgsd.studies.matrix,", files, method=method)
+    check_made(paths, "03_train and 04_evaluate, or python -m mmgsd run models,", files, method=method)
 
 
 def run(paths: Paths, *, method: str = "mmgsd", objects: Sequence[str] = OBJECTS, worst: int = 24) -> Path:

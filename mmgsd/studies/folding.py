@@ -1,20 +1,19 @@
 """The bench: rollouts of every policy from the same first states, as files, and what came of them.
 
-    python -m mmgsd.studies.folding quick         -> data/results/quick/folding.json, figures/quick/folding*
-    python -m mmgsd.studies.folding quick --only mmgsd       those policies whose name holds that text
-    python -m mmgsd.studies.folding quick --trained          the four methods as the preset quick trains them
-    python -m mmgsd.studies.folding demonstrations           -> data/demonstrations, what policies are shown
+    python -m mmgsd run folding quick              -> data/results/quick/folding.json, figures/quick/folding*
+    python -m mmgsd run folding quick --only mmgsd those policies whose name holds that text
+    python -m mmgsd run folding quick --trained    the four methods as the preset quick trains them
+    python -m mmgsd run folding demonstrations     -> data/demonstrations, what policies are shown
 
 All go in step: first states, every policy's answers, what physics makes of them, the next look. A killed run goes on.
 """
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
@@ -22,7 +21,7 @@ from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 
 from mmgsd.checks import check_choice
-from mmgsd.command import run_command
+from mmgsd.command import Option
 from mmgsd.config import DEFAULT_GROUP, OBJECTS
 from mmgsd.figures.folding import mark_moves, mark_success, plot_rollouts, save_slides
 from mmgsd.figures.style import PAGE_IN, check_filled, finish_axes, save_figure, styled
@@ -460,7 +459,7 @@ def judge_several(results: Results) -> Claim:
         "several", "Our question: may each of several picks take its own surest match?",
         "Folding by each pixel's surest mode ends no farther off than by modes that agree, as far as the 95 % interval "
         "of the difference tells; a part each object.", f"successes, {'; '.join(shown)}", parts,
-        "`.venv/bin/python -m mmgsd.studies.folding paper`",
+        "`.venv/bin/python -m mmgsd run folding paper`",
     )  # fmt: skip
 
 
@@ -505,30 +504,24 @@ STUDY = Study(
 )  # fmt: skip
 
 
-def main() -> None:
+def main(
+    preset: Annotated[str, Option(choices=(*ROLLOUTS, DEMONSTRATIONS))],
+    *,
+    only: Annotated[str, Option("policies whose name holds this text; their rows alone are written")] = "",
+    trained: Annotated[bool, Option(f"instead the four methods' models that the preset {TRAINED_BY} trained")] = False,
+    workers: Annotated[int, Option("child processes at once (default: one a core)")] = 0,
+    scheduler: Annotated[str, Option("address of a Dask scheduler; none: this machine")] = "",
+) -> None:
     """Run the bench of a preset, or write the demonstrations."""
-    parser = argparse.ArgumentParser(prog="python -m mmgsd.studies.folding", description=__doc__.split("\n")[0])
-    parser.add_argument("preset", choices=(*ROLLOUTS, DEMONSTRATIONS))
-    parser.add_argument("--only", default="", help="policies whose name holds this text; their rows alone are written")
-    parser.add_argument("--trained", action="store_true",
-                        help=f"instead the four methods' models that the preset {TRAINED_BY} trained")  # fmt: skip
-    parser.add_argument("--workers", type=int, default=0, help="child processes at once (default: one a core)")
-    parser.add_argument("--scheduler", default="", help="address of a Dask scheduler; none: this machine")
-    args = parser.parse_args()
-    if args.preset == DEMONSTRATIONS:
-        if args.only:
-            parser.error(f"--only {args.only!r} must be given with a preset, got {DEMONSTRATIONS}")
-        how = {"workers": args.workers, "scheduler": args.scheduler}
-        print("\n".join(map(str, write_demonstrations(find_root(), **how))))
+    how = {"workers": workers, "scheduler": scheduler}
+    if preset == DEMONSTRATIONS:
+        if only:
+            raise ValueError(f"--only {only!r} must be given with a preset, got {DEMONSTRATIONS}")
+        print(*write_demonstrations(find_root(), **how), sep="\n")
         return
-    asked = [policy for policy in POLICIES.values() if policy.trained] if args.trained else SHIPPED
-    policies = [POLICIES["truth"], *(p for p in asked if args.only in p.name and p.name != "truth")]
-    if not any(args.only in policy.name for policy in asked):
-        parser.error(
-            f"--only {args.only!r}: no policy has a name with that; there are {', '.join(p.name for p in asked)}"
-        )
-    print(run_folding(args.preset, find_root(), policies=policies, workers=args.workers, scheduler=args.scheduler))
-
-
-if __name__ == "__main__":
-    run_command(main, kept="finished states and answers are kept, and the same command goes on")
+    asked = [policy for policy in POLICIES.values() if policy.trained] if trained else SHIPPED
+    policies = [POLICIES["truth"], *(p for p in asked if only in p.name and p.name != "truth")]
+    if not any(only in policy.name for policy in asked):
+        names = ", ".join(policy.name for policy in asked)
+        raise ValueError(f"--only {only!r}: no policy has a name with that; there are {names}")
+    print(run_folding(preset, find_root(), policies=policies, **how))

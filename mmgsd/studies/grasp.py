@@ -1,6 +1,6 @@
 """Take the corner that you are surest of: one grasp by one pixel's matches, and what it lifts.
 
-    python -m mmgsd.studies.grasp paper    -> data/results/paper/grasp.json
+    python -m mmgsd run grasp paper    -> data/results/paper/grasp.json
 
 A policy is shown one corner of a flat cloth, and a picture of another cloth; it grasps at one of the four modes,
 carries what it holds to the middle of what it sees, and lets go. A corner is lifted where one then lies within `NEAR`
@@ -9,14 +9,13 @@ of the side of that place. A killed run goes on.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
-from mmgsd.command import run_command
+from mmgsd.command import Option
 from mmgsd.config import DEFAULT_GROUP
 from mmgsd.files import write_json
 from mmgsd.fold.jobs import act_job, read_state, run_jobs
@@ -129,7 +128,7 @@ def judge_surest(results: Results) -> Claim:
         "surest", "Of the four like corners, a robot should take the one that it is surest of.",
         "One grasp: the surest of the four modes is nearer to a corner than any of them, as far as the 95 % interval "
         "of the difference tells.", "; ".join(shown) or "–", (None if high is None else high < 0,),
-        "`.venv/bin/python -m mmgsd.studies.grasp paper`",
+        "`.venv/bin/python -m mmgsd run grasp paper`",
     )  # fmt: skip
 
 
@@ -137,14 +136,10 @@ STUDY = Study("grasp", 100, run, results=("grasp",), tables={"grasp": Shown("pap
               claims=(judge_surest,))  # fmt: skip
 
 
-def main() -> None:
+def main(
+    preset: Annotated[str, Option(choices=ROLLOUTS)],
+    *,
+    workers: Annotated[int, Option("child processes at once (default: one a core)")] = 0,
+) -> None:
     """Grasp with every matcher."""
-    parser = argparse.ArgumentParser(prog="python -m mmgsd.studies.grasp", description=__doc__.split("\n")[0])
-    parser.add_argument("preset", choices=tuple(ROLLOUTS))
-    parser.add_argument("--workers", type=int, default=0, help="child processes at once (default: one a core)")
-    args = parser.parse_args()
-    print(run(Paths(find_root(), args.preset), workers=args.workers))
-
-
-if __name__ == "__main__":
-    run_command(main, kept="finished states are kept, and the same command goes on")
+    print(run(Paths(find_root(), preset), workers=workers))

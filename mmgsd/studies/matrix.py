@@ -1,24 +1,24 @@
 """All models of a preset and its baselines as independent tasks, the most important first: here, or on a Dask cluster.
 
-    python -m mmgsd.studies.matrix paper                              trains and asks each model; a killed call goes on
-    python -m mmgsd.studies.matrix paper --only cloth-spcl            those whose name holds that text
-    python -m mmgsd.studies.matrix paper --scheduler tcp://host:8786  each worker one model at a time, on its own GPU
-    python -m mmgsd.studies.matrix quick --seeds 3                    instead the seeds study, each model with three
-    python -m mmgsd.studies.matrix paper --study robustness           instead the models of one study
-    python -m mmgsd.studies.matrix quick --study robustness --steps 300         each of so many steps
+    python -m mmgsd run models paper                                  trains and asks each model; a killed call goes on
+    python -m mmgsd run models paper --only cloth-spcl                those whose name holds that text
+    python -m mmgsd run models paper --scheduler tcp://host:8786      each worker one model at a time, on its own GPU
+    python -m mmgsd run models quick --seeds 3                        instead the seeds study, each model with three
+    python -m mmgsd run models paper --study robustness               instead the models of one study
+    python -m mmgsd run models quick --study robustness --steps 300   each of so many steps
 
 Notebooks find the models and their tables of answers where they would have put them.
 """
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Annotated
 
 from mmgsd.checks import read_count
 from mmgsd.cluster import open_client, wait_for_each
-from mmgsd.command import run_command
+from mmgsd.command import Option
 from mmgsd.config import OBJECTS, Preset, TrainConfig, load_preset
 from mmgsd.files import DamagedFileError
 from mmgsd.learn.training import train_model
@@ -47,7 +47,7 @@ from mmgsd.studies.models import (
 from mmgsd.studies.parameters import read_scheduler
 
 TABLES = ("budget", "robustness", "backbones")  # studies with a file of their own, of models under their rows' names
-ALL = "`.venv/bin/python -m mmgsd.studies.matrix paper`"  # as documents say it
+ALL = "`.venv/bin/python -m mmgsd run models paper`"  # as documents say it
 VALIDATIONS = 8  # RMSE on held-out simulations, in a model's log
 
 Task = TrainConfig | tuple[str, str]  # a model to train and ask, or an object and a baseline to ask
@@ -259,31 +259,25 @@ def _find_row(paths: Paths, key: str, model: TrainConfig | None, row: dict, run:
     return (row, run) if model is None or run.get("model") == model.name else ({}, {})
 
 
-def main() -> None:
+def main(
+    preset: str,
+    *,
+    only: Annotated[str, Option("those whose name holds this text, like cloth or cloth-spcl")] = "",
+    study: Annotated[str, Option("instead the models of one study", choices=STUDIES)] = "",
+    seeds: Annotated[int, Option("instead the models compared by seeds, each with so many")] = 0,
+    steps: Annotated[int, Option(f"of those, or of the study {' or '.join(TABLES)}")] = 0,
+    scheduler: Annotated[str, Option("address of a Dask scheduler; none: this process")] = "",
+) -> None:
     """Run the models and baselines of a preset, a line each."""
-    parser = argparse.ArgumentParser(prog="python -m mmgsd.studies.matrix", description=__doc__.split("\n")[0])
-    parser.add_argument("preset")
-    parser.add_argument("--only", default="", help="those whose name holds this text, like cloth or cloth-spcl")
-    parser.add_argument("--study", default="", choices=STUDIES, help="instead the models of one study")
-    parser.add_argument("--seeds", type=int, default=0, help="instead the models compared by seeds, each with so many")
-    parser.add_argument("--steps", type=int, default=0, help=f"of those, or of the study {' or '.join(TABLES)}")
-    parser.add_argument("--scheduler", default="", help="address of a Dask scheduler; none: this process")
-    args = parser.parse_args()
-    if args.seeds < 0 or args.steps < 0 or (args.steps and not (args.seeds or args.study in TABLES)):
+    if seeds < 0 or steps < 0 or (steps and not (seeds or study in TABLES)):
         studies = " or ".join(TABLES)
-        parser.error(f"--seeds and --steps must be positive, and --steps needs --seeds or --study {studies}")
-    if args.study and args.seeds:
-        parser.error("--study and --seeds are two different lists of models: give one of them")
-    preset = load_preset(args.preset)
-    tasks = choose_tasks(preset, study=args.study, seeds=args.seeds, steps=args.steps)
-    tasks = [task for task in tasks if args.only in name_task(task)]
+        raise ValueError(f"--seeds and --steps must be positive, and --steps needs --seeds or --study {studies}, "
+                         f"got --seeds {seeds}, --steps {steps}, --study {study!r}")  # fmt: skip
+    if study and seeds:
+        raise ValueError(f"--study and --seeds are two different lists of models: give one, got {study!r} and {seeds}")
+    given = load_preset(preset)
+    tasks = [task for task in choose_tasks(given, study=study, seeds=seeds, steps=steps) if only in name_task(task)]
     if not tasks:
-        parser.error(f"--only {args.only!r}: no model or baseline of the preset {preset.name} has a name with that")
-    asked = {"study": args.study, "seeds": args.seeds, "steps": args.steps}
-    run_matrix(Paths(find_root(), preset.name), tasks, **asked, scheduler=read_scheduler("--scheduler", args.scheduler))
-
-
-if __name__ == "__main__":
-    run_command(
-        main, kept="finished models and answers are kept, and the same command goes on from the last checkpoint"
-    )
+        raise ValueError(f"--only {only!r}: no model or baseline of the preset {given.name} has a name with that")
+    asked = {"study": study, "seeds": seeds, "steps": steps}
+    run_matrix(Paths(find_root(), given.name), tasks, **asked, scheduler=read_scheduler("--scheduler", scheduler))

@@ -8,7 +8,6 @@ readers take text as well: "8", "false", "[1, 4]", "cloth rope".
 from __future__ import annotations
 
 import ast
-import difflib
 import json
 import math
 import numbers
@@ -18,7 +17,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, MutableMapp
 from pathlib import Path
 from typing import Any
 
-from mmgsd.checks import read_flag  # noqa: F401  # a reader as well
+from mmgsd.checks import check, describe_choices, read_flag  # noqa: F401  # a reader as well
 from mmgsd.config import PRESETS, TrainConfig
 from mmgsd.paths import Paths, find_root, find_shipped
 from mmgsd.studies.models import list_rows
@@ -38,7 +37,7 @@ def read_parameters(namespace: MutableMapping[str, Any], **readers: Reader) -> N
     for cell in namespace.get("In", [])[-3:-1]:  # the parameters and papermill's, if this cell is run after them
         for name in _list_assigned(cell, readers):
             if name not in readers:
-                raise ValueError(f"{name} is no parameter of this notebook: {_describe_choices(name, readers)}")
+                raise ValueError(f"{name} is no parameter of this notebook: {describe_choices(name, readers)}")
     for name in readers:
         if name not in namespace:
             raise ValueError(f"{name} must be set in the cell of the parameters")
@@ -78,6 +77,16 @@ def check_training(paths: Paths, models: Iterable[TrainConfig], *, overwrite: bo
     check_images(paths, sorted({model.object for model, trained in there.items() if not trained}), split="train")
 
 
+def one_of(choices: Collection[str]) -> Reader:
+    """A reader of one of some names."""
+
+    def read(name: str, value: Any) -> str:
+        check(name, value, describe_choices(value, choices), isinstance(value, str) and value.strip() in choices)
+        return value.strip()
+
+    return read
+
+
 def read_preset(name: str, value: Any) -> str:
     """The name of a preset."""
     return one_of(PRESETS)(name, value)
@@ -88,64 +97,40 @@ def read_method(name: str, value: Any) -> str:
     return one_of([row.name for row in list_rows("main")])(name, value)
 
 
-def one_of(choices: Collection[str]) -> Reader:
-    """A reader of one of some names."""
-
-    def read(name: str, value: Any) -> str:
-        if not isinstance(value, str) or value.strip() not in choices:
-            _refuse(name, value, _describe_choices(value, choices))
-        return value.strip()
-
-    return read
-
-
 def among(values: Collection[int], whose: str) -> Reader:
     """A reader of one of some whole numbers, ``whose`` says which these are."""
-
-    def read(name: str, value: Any) -> int:
-        found = _to_number(value)
-        if found not in values:
-            first = ", ".join(map(str, sorted(values)[:3]))
-            _refuse(name, value, f"one of {whose} ({first}, … {max(values)})")
-        return int(found)
-
-    return read
+    first = ", ".join(map(str, sorted(values)[:3]))
+    return _numbers(f"one of {whose} ({first}, … {max(values)})", lambda found: found in values, int)
 
 
-def whole(least: int = 0, most: int | None = None) -> Reader:
+def whole(least: int = 0, most: float = math.inf) -> Reader:
     """A reader of whole numbers from ``least`` on, up to and with ``most`` if given."""
     accepted = f"a whole number {_describe_range(least, most)}"
-
-    def read(name: str, value: Any) -> int:
-        found = _to_number(value)
-        if found is None or found != int(found) or found < least or (most is not None and found > most):
-            _refuse(name, value, accepted)
-        return int(found)
-
-    return read
+    return _numbers(accepted, lambda found: found == int(found) and least <= found <= most, int)
 
 
 def number(*, above: float | None = None, least: float = -math.inf, most: float = math.inf) -> Reader:
     """A reader of finite numbers ``above`` one, or from ``least`` to ``most``."""
     accepted = f"a number {_describe_range(least, most)}" if above is None else f"a number greater than {above:g}"
+    return _numbers(accepted, lambda found: least <= found <= most and (above is None or found > above), float)
 
-    def read(name: str, value: Any) -> float:
+
+def _numbers(accepted: str, fits: Callable[[float], bool], kind: type) -> Reader:
+    def read(name: str, value: Any) -> Any:
         found = _to_number(value)
-        if found is None or not least <= found <= most or (above is not None and found <= above):
-            _refuse(name, value, accepted)
-        return found
+        check(name, value, accepted, found is not None and fits(found))
+        return kind(found)
 
     return read
 
 
-def listed(reader: Reader, *, least: int = 0, most: int | None = None) -> Reader:
+def listed(reader: Reader, *, least: int = 0, most: float = math.inf) -> Reader:
     """A reader of lists of so many items; text may hold a list, or items between commas or blanks."""
-    accepted = f"{least}" if least == most else f"{_describe_range(least, most)}"
+    accepted = f"a list, its length {least if least == most else _describe_range(least, most)}"
 
     def read(name: str, value: Any) -> list:
         items = _to_list(value)
-        if items is None or len(items) < least or (most is not None and len(items) > most):
-            _refuse(name, value, f"a list, its length {accepted}")
+        check(name, value, accepted, items is not None and least <= len(items) <= most)
         return [reader(f"each of {name}", item) for item in items]
 
     return read
@@ -172,8 +157,8 @@ def read_pixels(name: str, value: Any) -> list[list[float]]:
         pixels = [pixels]
     pixels = [_to_list(pixel) or [] for pixel in pixels or []]
     found = [[_to_number(item) for item in pixel] for pixel in pixels]
-    if not found or any(len(pixel) != 2 or None in pixel for pixel in found):
-        _refuse(name, value, "pixels [[column, row], …] of image0, such as [[235, 80]]")
+    right = bool(found) and all(len(pixel) == 2 and None not in pixel for pixel in found)
+    check(name, value, "pixels [[column, row], …] of image0, such as [[235, 80]]", right)
     return found
 
 
@@ -184,8 +169,7 @@ def read_device(name: str, value: Any) -> str:
     gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
     names = ["", "cpu", *(["cuda", *(f"cuda:{i}" for i in range(gpus))] if gpus else [])]
     value = "" if value is None else value
-    if value not in names:
-        _refuse(name, value, _describe_choices(value, names) + ("" if gpus else ": torch finds no GPU here"))
+    check(name, value, describe_choices(value, names) + ("" if gpus else ": torch finds no GPU here"), value in names)
     return value
 
 
@@ -194,8 +178,8 @@ def read_scheduler(name: str, value: Any) -> str:
     if value is None or value == "":
         return ""
     found = ADDRESS.fullmatch(value) if isinstance(value, str) else None
-    if not found or not 0 < int(found["port"]) < 65536:
-        _refuse(name, value, 'an address host:port or tcp://host:port, or "" for none')
+    right = found is not None and 0 < int(found["port"]) < 65536
+    check(name, value, 'an address host:port or tcp://host:port, or "" for none', right)
     try:
         socket.create_connection((found["host"].strip("[]"), int(found["port"])), timeout=SECONDS).close()
     except OSError as error:
@@ -211,7 +195,7 @@ def read_weights(name: str, value: Any) -> str:
     try:
         found = find_file(value, name)
     except ValueError as error:
-        raise ValueError(f"{error}; or {_describe_choices(value, shipped)}") from error
+        raise ValueError(f"{error}; or {describe_choices(value, shipped)}") from error
     return str(value) if Path(value).is_file() else str(found)  # a model's name depends on how its start was written
 
 
@@ -254,16 +238,8 @@ def _list_assigned(cell: str, known: Mapping[str, Any]) -> list[str]:
     return names if cell.startswith(INJECTED) or set(names) & set(known) else []
 
 
-def _describe_choices(value: Any, choices: Collection[str]) -> str:
-    """ "one of 'a', 'b' (did you mean 'a'?)"."""
-    close = difflib.get_close_matches(str(value), choices, n=1)
-    return f"one of {', '.join(map(repr, choices))}" + (f" (did you mean {close[0]!r}?)" if close else "")
-
-
-def _describe_range(least: float, most: float | None) -> str:
-    if most is None or math.isinf(most):
-        return f"from {least:g} on"
-    return f"from {least:g} to {most:g}"
+def _describe_range(least: float, most: float) -> str:
+    return f"from {least:g} on" if math.isinf(most) else f"from {least:g} to {most:g}"
 
 
 def _to_number(value: Any) -> float | None:
@@ -289,7 +265,3 @@ def _to_list(value: Any) -> list | None:
     if _to_number(value) is not None:
         return [value]
     return list(value) if isinstance(value, Iterable) and not isinstance(value, Mapping) else None
-
-
-def _refuse(name: str, value: Any, accepted: str) -> None:
-    raise ValueError(f"{name} must be {accepted}, got {value!r}")

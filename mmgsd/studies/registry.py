@@ -6,6 +6,8 @@ there: nothing lists the studies.
 
 from __future__ import annotations
 
+import argparse
+import ast
 import importlib
 import pkgutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -13,13 +15,15 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import ModuleType
+from typing import TYPE_CHECKING, Annotated, Any
 
 import pandas as pd
 
 import mmgsd.studies
 from mmgsd.checks import check_choice
-from mmgsd.config import Preset, load_preset
+from mmgsd.command import Option
+from mmgsd.config import PRESETS, Preset, load_preset
 from mmgsd.files import DamagedFileError, read_json
 from mmgsd.paths import Paths, find_root
 from mmgsd.studies.claims import Claim
@@ -156,11 +160,16 @@ class Experiment:
         return show_stored(path)
 
 
-def list_studies() -> list[Study]:
-    """All studies, in their order."""
+def list_modules() -> list[ModuleType]:
+    """The modules of all studies, in their order."""
     names = [module.name for module in pkgutil.iter_modules(mmgsd.studies.__path__) if module.name[0] != "_"]
     modules = [importlib.import_module(f"mmgsd.studies.{name}") for name in names]
-    return sorted((m.STUDY for m in modules if hasattr(m, "STUDY")), key=lambda study: (study.place, study.name))
+    return sorted((m for m in modules if hasattr(m, "STUDY")), key=lambda m: (m.STUDY.place, m.STUDY.name))
+
+
+def list_studies() -> list[Study]:
+    """All studies, in their order."""
+    return [module.STUDY for module in list_modules()]
 
 
 def get_study(name: str) -> Study:
@@ -180,7 +189,7 @@ def open_study(name: str, preset: str, *, run: bool = False, **options: Any) -> 
     if run:
         study.check(paths, **options)
     else:
-        by = f"{study.notebook} with run=True" if study.notebook else f"python -m mmgsd.studies run {name}"
+        by = f"{study.notebook} with run=True" if study.notebook else f"python -m mmgsd run {name}"
         check_made(paths, by, shown)
     return Experiment(study, paths, run, options, shown)
 
@@ -201,6 +210,32 @@ def run_study(name: str, preset: str, *, root: Path | None = None, **options: An
     study, paths = get_study(name), Paths(root or find_root(), load_preset(preset).name)
     study.check(paths, **options)
     return study.run(paths, **options)
+
+
+def make_command(name: str) -> Callable[..., None]:
+    """What ``mmgsd run NAME`` calls, with its options."""
+
+    def run(
+        *,
+        preset: Annotated[str, Option("whose models and images", choices=tuple(PRESETS))] = "quick",
+        set: Annotated[list, Option("of what the study's `run` takes; may be given several times", type=read_option,
+                                    action="append", metavar="NAME=VALUE")] = (),
+    ) -> None:  # fmt: skip
+        print(run_study(name, preset, **dict(set or ())))
+
+    run.__module__ = next(module.__name__ for module in list_modules() if module.STUDY.name == name)  # for its words
+    return run
+
+
+def read_option(text: str) -> tuple[str, Any]:
+    """ "steps=4000": the name, and the value as Python writes it, else as text."""
+    name, equals, value = text.partition("=")
+    if not equals or not name.isidentifier():
+        raise argparse.ArgumentTypeError(f"must be NAME=VALUE, got {text!r}")
+    try:
+        return name, ast.literal_eval(value)
+    except (ValueError, SyntaxError):
+        return name, value
 
 
 def load_results(folder: Path) -> dict[str, Any]:

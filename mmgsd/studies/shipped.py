@@ -1,9 +1,9 @@
 """What shipped weights, and what one would pick instead, do on clean renders, on cluttered ones and on photographs.
 
-    python -m mmgsd.studies.shipped cloth cloth-paper daisy --photographs FOLDER    -> data/results/shipped.json
-    python -m mmgsd.studies.shipped cloth@1,1 --photographs FOLDER     its modes read with another power and sharpness
-    python -m mmgsd.studies.shipped robustness --photographs FOLDER    the models of that study, once they are trained
-    python -m mmgsd.studies.shipped cloth --cloth-renders FOLDER       and others' renders of a cloth
+    python -m mmgsd run shipped cloth cloth-paper daisy --photographs FOLDER    -> data/results/shipped.json
+    python -m mmgsd run shipped cloth@1,1 --photographs FOLDER     its modes read with another power and sharpness
+    python -m mmgsd run shipped robustness --photographs FOLDER    the models of that study, once they are trained
+    python -m mmgsd run shipped cloth --cloth-renders FOLDER       and others' renders of a cloth
 
 A row a name: of weights in data/weights; of a baseline, which is asked about each object with the true masks, and in
 photographs with those that the shipped weights see, and whose modes are read as theirs; or of each model of a study of
@@ -16,16 +16,15 @@ killed call goes on.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import pandas as pd
 
 from mmgsd.checks import read_count
-from mmgsd.command import run_command
+from mmgsd.command import Option
 from mmgsd.config import OBJECTS, PRESETS, Preset, load_preset
 from mmgsd.files import write_json
 from mmgsd.match.baselines import BASELINES, OPTIONAL
@@ -40,6 +39,7 @@ from mmgsd.studies.table import ERRORS, Table, make_page_table, say_value
 
 STUDIES = ("robustness", "backbones")
 RESULTS = "shipped.json"
+NAMES = ", ".join((*BASELINES, *OPTIONAL, *STUDIES))  # that may be measured besides weights
 Rows = Mapping[str, Mapping[str, Any]]  # data/results/shipped.json, {name: what `mmgsd.measure.shipped` found}
 SETS = {"paper": "clean", "workspace": "cluttered"}  # test images: what readers know them as
 SIDES = {"cloth": "side", "rope": "length"}  # of what an error is a share
@@ -227,7 +227,7 @@ def measure_study(
     missing = [str(file) for file in files.values() if not file.is_file()]
     if missing:
         asked = f"{preset.name} --study {study}" + (f" --steps {steps}" if steps else "")
-        raise FileNotFoundError(f"{missing[0]} does not exist: run python -m mmgsd.studies.matrix {asked}")
+        raise FileNotFoundError(f"{missing[0]} does not exist: run python -m mmgsd run models {asked}")
     how = {"photographs": photographs, "presets": (preset.name, preset.cluttered)}
     return {key: measure_weights(key, root, weights=file, **how) | {"preset": preset.name, "steps": models[key].steps}
             for key, file in files.items()}  # fmt: skip
@@ -262,26 +262,19 @@ def run(paths: Paths, *, names: Sequence[str] = ("cloth", "rope", "cloth-paper",
     return out
 
 
-def main() -> None:
+def main(
+    *names: Annotated[str, Option(f"weights in data/weights, alone or with @POWER,SHARPNESS, {NAMES}", metavar="NAME")],
+    photographs: Annotated[Path, Option("marked photographs, with index.json", metavar="FOLDER")] | None = None,
+    photographs_alone: Annotated[bool, Option("leave the presets' test images out: they take longest")] = False,
+    cloth_renders: Annotated[Path, Option("others' renders, with knots_info.json", metavar="FOLDER")] | None = None,
+    preset: Annotated[str, Option("of the study (default: paper)", choices=PRESETS)] = "paper",
+    steps: Annotated[int, Option("of each model of a study (default: the study's own)")] = 0,
+    object: Annotated[str, Option("of a study's models those of one object", choices=OBJECTS)] = "",
+) -> None:
     """Measure some weights and baselines and put their rows into the results."""
-    parser = argparse.ArgumentParser(prog="python -m mmgsd.studies.shipped", description=__doc__.split("\n")[0])
-    parser.add_argument(
-        "names",
-        nargs="+",
-        metavar="NAME",
-        help=f"weights in data/weights, alone or with @POWER,SHARPNESS, {', '.join((*BASELINES, *OPTIONAL, *STUDIES))}",
-    )
-    parser.add_argument("--photographs", type=Path, metavar="FOLDER", help="marked photographs, with index.json")
-    parser.add_argument(
-        "--photographs-alone", action="store_true", help="leave the presets' test images out: they take longest"
-    )
-    parser.add_argument("--cloth-renders", type=Path, metavar="FOLDER", help="others' renders, with knots_info.json")
-    parser.add_argument("--preset", default="paper", choices=tuple(PRESETS), help="of the study (default: paper)")
-    parser.add_argument("--steps", type=int, default=0, help="of each model of a study (default: the study's own)")
-    parser.add_argument("--object", default="", choices=OBJECTS, help="of a study's models those of one object")
-    how = vars(parser.parse_args())
-    how["steps"] = read_count("--steps", how["steps"])
-    run(Paths(find_root(), how["preset"]), **how)
+    how = {"photographs": photographs, "photographs_alone": photographs_alone, "cloth_renders": cloth_renders}
+    how |= {"preset": preset, "steps": read_count("--steps", steps), "object": object}
+    run(Paths(find_root(), preset), names=names, **how)
 
 
 STUDY = Study(
@@ -298,7 +291,3 @@ STUDY = Study(
         "cloth_renders": Shown(RESULTS, describe_cloth_renders),
     },
 )  # fmt: skip
-
-
-if __name__ == "__main__":
-    run_command(main)

@@ -1,6 +1,6 @@
 """Points through films of objects that are folded, turned and hidden: do they stay where, and what, they are?
 
-    python -m mmgsd.studies.tracking paper    -> data/results/paper/tracking.json, figures/paper/tracking
+    python -m mmgsd run tracking paper    -> data/results/paper/tracking.json, figures/paper/tracking
 
 The folding bench's physics makes the films (`mmgsd.fold.jobs.film_job`), with truth for every frame. `METHODS` follow
 `POINTS` of those that the first frame shows. Films and answers are files: a killed run goes on.
@@ -8,13 +8,12 @@ The folding bench's physics makes the films (`mmgsd.fold.jobs.film_job`), with t
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
@@ -22,7 +21,7 @@ from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 
 from mmgsd.checks import check_choice
-from mmgsd.command import run_command
+from mmgsd.command import Option
 from mmgsd.config import DEFAULT_GROUP, IMAGE_SIZE, OBJECTS
 from mmgsd.figures.style import PAGE_IN, check_filled, finish_axes, save_figure, styled
 from mmgsd.files import DamagedFileError, read_json, set_aside, write_json
@@ -255,16 +254,13 @@ def figure(results: Mapping[str, Any]) -> Figure:
     return finish_axes(drawn)
 
 
-def main() -> None:
+def main(
+    preset: Annotated[str, Option(choices=tuple(FILMS))],
+    *,
+    count: Annotated[int, Option("films of each object (default: the preset's)")] = 0,
+    frames: Annotated[int, Option(f"of a film (default: {FRAMES})")] = FRAMES,
+    scale: Annotated[float, Option("of a frame's sides (default: 1, full size)")] = SCALE,
+    workers: Annotated[int, Option("child processes at once (default: one a core)")] = 0,
+) -> None:
     """Follow points through the films of a preset."""
-    parser = argparse.ArgumentParser(prog="python -m mmgsd.studies.tracking", description=__doc__.split("\n")[0])
-    parser.add_argument("preset", choices=tuple(FILMS))
-    parser.add_argument("--count", type=int, default=0, help="films of each object (default: the preset's)")
-    parser.add_argument("--frames", type=int, default=FRAMES, help=f"of a film (default: {FRAMES})")
-    parser.add_argument("--scale", type=float, default=SCALE, help="of a frame's sides (default: 1, full size)")
-    parser.add_argument("--workers", type=int, default=0, help="child processes at once (default: one a core)")
-    print(run(root=find_root(), **vars(parser.parse_args())))
-
-
-if __name__ == "__main__":
-    run_command(main, kept="finished films and answers are kept, and the same command goes on")
+    print(run(preset, root=find_root(), count=count, frames=frames, scale=scale, workers=workers))

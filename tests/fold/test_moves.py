@@ -173,4 +173,4 @@ def test_the_command_draws_the_moves_and_replaces_no_image(data, written, capsys
     copy = tmp_path / "now.png"
     copy.write_bytes(out.read_bytes())
     said = fail(capsys, str(written), str(copy), "--weights", "cloth", "--out", str(copy))
-    assert "--out must not be the image itself" in said and copy.read_bytes() == out.read_bytes()
+    assert "--out must not be " in said and copy.read_bytes() == out.read_bytes()

@@ -36,10 +36,9 @@ def test_the_command_writes_a_row_and_keeps_the_others(tmp_path: Path, monkeypat
     out = tmp_path / "data" / "results" / "joint.json"
     out.parent.mkdir()
     out.write_text('{"other": {"object": "cloth"}}')
-    monkeypatch.setattr("sys.argv", ["joint", "rope"])
     monkeypatch.setenv("MMGSD_ROOT", str(tmp_path))
     monkeypatch.setattr(joint.measure_joint, "__kwdefaults__", {"pairs": 2, "progress": False})
-    main()
+    main("rope")
     rows = json.loads(out.read_text())
     assert list(rows) == ["other", "rope"] and rows["rope"]["paper"]["all"]["questions"] == 6
     assert all(0 <= rows["rope"]["workspace"]["all"][name] <= 1 for name in CHOSEN)

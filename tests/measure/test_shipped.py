@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -57,16 +56,13 @@ def test_baselines_are_measured_on_both_sets(root: Path) -> None:
 
 def test_photographs_of_a_row_outlast_a_call_without_them(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shipped, "measure_photographs", lambda *_, **__: {"best": 3.0})
-    run = [sys.executable, "mine"]
-    monkeypatch.setattr(sys, "argv", [*run, "--photographs", "somewhere"])
-    main()
-    monkeypatch.setattr(sys, "argv", run)
-    main()
+    main("mine", photographs=Path("somewhere"))
+    main("mine")
     rows = json.loads((root / "data" / "results" / "shipped.json").read_text())
     assert rows["mine"]["photographs"] == {"best": 3.0}
     rows["mine"]["sha256"] = "of other weights"
     (root / "data" / "results" / "shipped.json").write_text(json.dumps(rows))
-    main()
+    main("mine")
     rows = json.loads((root / "data" / "results" / "shipped.json").read_text())
     assert "photographs" not in rows["mine"]
 
@@ -87,13 +83,11 @@ def test_a_baseline_is_told_where_the_object_is_seen() -> None:
 
 
 def test_a_study_that_is_not_trained_says_how_to_train_it(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "argv", [sys.executable, "robustness"])
-    with pytest.raises(FileNotFoundError, match="run python -m mmgsd.studies.matrix paper --study robustness"):
-        main()
+    with pytest.raises(FileNotFoundError, match="run python -m mmgsd run models paper --study robustness"):
+        main("robustness")
     monkeypatch.setattr(study, "load_preset", load_preset)
-    monkeypatch.setattr(sys, "argv", [sys.executable, "robustness", "--preset", "quick", "--steps", "7"])
-    with pytest.raises(FileNotFoundError, match="matrix quick --study robustness --steps 7"):
-        main()
+    with pytest.raises(FileNotFoundError, match="models quick --study robustness --steps 7"):
+        main("robustness", preset="quick", steps=7)
 
 
 def test_a_study_of_another_preset_is_asked_about_its_own_images(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -109,9 +103,8 @@ def test_a_study_of_another_preset_is_asked_about_its_own_images(root: Path, mon
     assert rows["cloth-mmgsd"] == {"preset": "quick", "steps": 7}
 
 
-def test_a_name_may_say_how_modes_are_read(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "argv", [sys.executable, "mine", "mine@1,1", "mine@2,4"])
-    main()
+def test_a_name_may_say_how_modes_are_read(root: Path) -> None:
+    main("mine", "mine@1,1", "mine@2,4")
     rows = json.loads((root / "data" / "results" / "shipped.json").read_text())
     assert [(row["power"], row["sharpness"]) for row in rows.values()] == [(1, 1), (1, 1), (2, 4)]
     own, same, other = (row["paper"]["rmse_mean"] for row in rows.values())
@@ -126,30 +119,25 @@ def test_another_reading_is_two_numbers(root: Path, name: str) -> None:
 
 def test_photographs_alone_keep_what_renders_gave(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     results = root / "data" / "results" / "shipped.json"
-    monkeypatch.setattr(sys, "argv", [sys.executable, "mine@2,4"])
-    main()
+    main("mine@2,4")
     before = json.loads(results.read_text())["mine@2,4"]
     monkeypatch.setattr(shipped, "read_photographs", lambda *_: [])
     monkeypatch.setattr(shipped, "measure_answers", lambda *_, **__: {"best": 3.0})
     monkeypatch.setattr(shipped, "evaluate_model", None)  # not asked
-    monkeypatch.setattr(sys, "argv", [sys.executable, "mine@2,4", "--photographs", "somewhere", "--photographs-alone"])
-    main()
+    main("mine@2,4", photographs=Path("somewhere"), photographs_alone=True)
     assert json.loads(results.read_text())["mine@2,4"] == before | {"photographs": {"best": 3.0}}
 
 
 def test_photographs_alone_need_no_renders_of_anything(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     results = root / "data" / "results" / "shipped.json"
-    monkeypatch.setattr(sys, "argv", [sys.executable, "mine", "daisy"])
-    main()
+    main("mine", "daisy")
     before = json.loads(results.read_text())
     for preset in shipped.SETS:
         shutil.rmtree(Paths(root, preset).dataset("cloth"))
     monkeypatch.setattr(shipped, "read_photographs", lambda *_: [])
     monkeypatch.setattr(shipped, "measure_answers", lambda *_, **__: {"best": 3.0})
     monkeypatch.setattr(shipped, "measure_photographs", lambda *_, **__: {"best": 4.0})
-    asked = ["mine", "daisy", "--photographs", "somewhere", "--photographs-alone"]
-    monkeypatch.setattr(sys, "argv", [sys.executable, *asked])
-    main()
+    main("mine", "daisy", photographs=Path("somewhere"), photographs_alone=True)
     after = json.loads(results.read_text())
     assert after == {"mine": before["mine"] | {"photographs": {"best": 4.0}},
                      "cloth-daisy": before["cloth-daisy"] | {"photographs": {"best": 3.0}}}  # fmt: skip

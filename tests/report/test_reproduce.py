@@ -15,6 +15,7 @@ from typing import Any
 import psutil
 import pytest
 
+from mmgsd.command import KEPT
 from mmgsd.paths import Paths
 from mmgsd.report import reproduce
 from mmgsd.report.reproduce import Screen, describe_failure, describe_state, running
@@ -26,6 +27,7 @@ STORED = {"01_render_data": 3.0, "03_train": 10.0}
 SLEEP = "import time; time.sleep(120)"  # s, more than any test takes
 COMMAND = f"""
 import os, sys
+from mmgsd.__main__ import main
 from mmgsd.report import reproduce
 
 def wait(preset):
@@ -33,8 +35,8 @@ def wait(preset):
         print(process.pid, flush=True)
         process.wait()
 
-reproduce.reproduce, sys.argv[1:] = wait, ["smoke"]
-reproduce.run_command(reproduce.main, kept=reproduce.KEPT)
+reproduce.reproduce = wait
+main(["reproduce", "smoke"])
 """  # with something that waits in the place of papermill
 
 
@@ -170,5 +172,5 @@ def test_the_command_ends_with_one_line_that_says_what_is_kept(number: signal.Si
         child = int(process.stdout.readline())
         process.send_signal(number)
         _, said = process.communicate(timeout=60)
-    assert (process.returncode, said) == (130, f"stopped: {reproduce.KEPT}\n")
+    assert (process.returncode, said) == (130, f"stopped: {KEPT}\n")
     assert not psutil.pid_exists(child)

@@ -178,20 +178,19 @@ def test_all_methods_are_asked_for_as_many_modes_but_one(
     assert asked == [told]
 
 
-@pytest.mark.parametrize(("words", "names"), [
-    ([], {"truth", "mmgsd", "mmgsd_paper", "spcl", "random"}),
-    (["--trained"], {"truth", "quick_mmgsd", "quick_unimodal"}),
-    (["--trained", "--only", "pcl"], {"truth", "quick_spcl", "quick_pcl"}),
+@pytest.mark.parametrize(("told", "names"), [
+    ({}, {"truth", "mmgsd", "mmgsd_paper", "spcl", "random"}),
+    ({"trained": True}, {"truth", "quick_mmgsd", "quick_unimodal"}),
+    ({"trained": True, "only": "pcl"}, {"truth", "quick_spcl", "quick_pcl"}),
 ])  # fmt: skip
 def test_the_command_runs_shipped_weights_or_trained_models(
-    words: list[str], names: set[str], monkeypatch: pytest.MonkeyPatch
+    told: dict, names: set[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[set[str]] = []
     monkeypatch.setattr(rollouts, "run_folding", lambda *_, policies, **__: asked.append({p.name for p in policies}))
-    monkeypatch.setattr("sys.argv", ["rollouts", "smoke", *words])
-    rollouts.main()
+    rollouts.main("smoke", **told)
     assert names <= asked[0] and "nothing" not in asked[0]
-    assert any("quick" in name for name in asked[0]) == ("--trained" in words)
+    assert any("quick" in name for name in asked[0]) == ("trained" in told)
 
 
 def test_another_preset_has_no_rollouts(tmp_path: Path) -> None:

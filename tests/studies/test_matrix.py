@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from dask.distributed import LocalCluster
 
+from mmgsd.__main__ import main
 from mmgsd.config import OBJECTS, Preset, load_preset
 from mmgsd.measure.evaluation import write_results
 from mmgsd.studies import matrix
@@ -61,8 +62,7 @@ def test_errors_of_several_seeds_are_written(
     preset = make_tiny(tiny_dataset, tmp_path)
     monkeypatch.setattr(matrix, "load_preset", lambda _: preset)
     monkeypatch.setattr(matrix, "find_root", lambda: tmp_path)
-    monkeypatch.setattr("sys.argv", ["matrix", "smoke", "--seeds", "2", "--steps", "1", "--only", "cloth-mm"])
-    matrix.main()
+    matrix.main("smoke", seeds=2, steps=1, only="cloth-mm")
     written = tmp_path / "data" / "results" / "smoke" / "seeds_1.json"
     table = json.loads(written.read_text())
     assert table.keys() == {"cloth"} and table["cloth"].keys() == {"mmgsd-0", "mmgsd-1"}
@@ -80,14 +80,12 @@ def test_errors_of_several_seeds_are_written(
     assert json.loads(written.read_text()) == {**table, "rope": {"pcl-0": of_budget}}
 
 
-@pytest.mark.parametrize("words", ["--seeds -1", "--steps 10", "--seeds 2 --steps -1", "--study main --steps 9"])
-def test_how_often_to_train_is_checked(
-    words: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
-    monkeypatch.setattr("sys.argv", ["matrix", "smoke", *words.split()])
-    with pytest.raises(SystemExit):
-        matrix.main()
-    assert "--seeds and --steps must be positive" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    "told", [{"seeds": -1}, {"steps": 10}, {"seeds": 2, "steps": -1}, {"study": "main", "steps": 9}]
+)
+def test_how_often_to_train_is_checked(told: dict) -> None:
+    with pytest.raises(ValueError, match="--seeds and --steps must be positive"):
+        matrix.main("smoke", **told)
 
 
 def test_baselines_come_before_the_studies() -> None:
@@ -135,17 +133,14 @@ def test_results_are_written_of_what_is_done(tiny_dataset: Callable[..., Path], 
     assert read_results(changed, tmp_path)["cloth"].keys() == {"sift"}
 
 
-def test_some_can_be_chosen_by_name(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+def test_some_can_be_chosen_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
     monkeypatch.setattr(matrix, "run_tasks", lambda tasks, *_, **__: asked.extend(tasks) or iter(()))
-    monkeypatch.setattr("sys.argv", ["mmgsd.studies.matrix", "paper", "--only", "rope-spcl"])
-    matrix.main()
+    matrix.main("paper", only="rope-spcl")
     assert [(m.object, m.method) for m in asked] == [("rope", "spcl")] * 7
     assert [m.steps for m in asked] == [4000, 1000, 1000, 1000, 4000, 4000, 3500]
-    monkeypatch.setattr("sys.argv", ["mmgsd.studies.matrix", "paper", "--only", "shirt"])
-    with pytest.raises(SystemExit):
-        matrix.main()
-    assert "'shirt'" in capsys.readouterr().err
+    with pytest.raises(ValueError, match="--only 'shirt'"):
+        matrix.main("paper", only="shirt")
 
 
 def read_results(preset: Preset, root: Path) -> dict[str, dict]:
@@ -188,34 +183,28 @@ def test_what_a_model_starts_from_is_trained_before_it(tiny_dataset: Callable[..
     assert there[deeper.name] == rmse
 
 
-@pytest.mark.parametrize(("words", "names"), [
-    ("--study robustness --only cloth", ["mmgsd", "mmgsd_workspace", "mmgsd_clutter", "mmgsd_heads"]),
-    ("--study shipped --only cloth", ["shipped"]),
+@pytest.mark.parametrize(("study", "names"), [
+    ("robustness", ["mmgsd", "mmgsd_workspace", "mmgsd_clutter", "mmgsd_heads"]), ("shipped", ["shipped"]),
 ])  # fmt: skip
-def test_a_study_can_be_run_alone(words: str, names: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_study_can_be_run_alone(study: str, names: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     chosen, paper = [], load_preset("paper")
     monkeypatch.setattr(matrix, "run_tasks", lambda tasks, *_, **__: chosen.extend(tasks) or iter(()))
-    monkeypatch.setattr("sys.argv", ["matrix", "paper", *words.split()])
-    matrix.main()
-    assert chosen == list(configure_study(paper, "cloth", words.split()[1]).values())
-    assert list(configure_study(paper, "cloth", words.split()[1])) == names
+    matrix.main("paper", study=study, only="cloth")
+    assert chosen == list(configure_study(paper, "cloth", study).values())
+    assert list(configure_study(paper, "cloth", study)) == names
 
 
 def test_a_study_can_be_run_at_a_smaller_budget(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     chosen, written = [], []
     monkeypatch.setattr(matrix, "run_tasks", lambda tasks, *_, **__: chosen.extend(tasks) or iter([("one", 1.0)]))
     monkeypatch.setattr(matrix, "_write_study", lambda models, paths, study: written.append(study))
-    monkeypatch.setattr("sys.argv", ["matrix", "quick", "--study", "robustness", "--steps", "7"])
-    matrix.main()
+    matrix.main("quick", study="robustness", steps=7)
     assert [model.steps for model in chosen] == [7] * 8 and written == ["robustness_7"]
     assert [model.also for model in chosen[:4]] == ["", *["workspace_quick"] * 3]
 
 
 @pytest.mark.parametrize("words", ["--study fixes", "--study robustness --seeds 2"])
-def test_a_study_that_is_another_list_is_refused(
-    words: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
-    monkeypatch.setattr("sys.argv", ["matrix", "paper", *words.split()])
+def test_a_study_that_is_another_list_is_refused(words: str, capsys: pytest.CaptureFixture) -> None:
     with pytest.raises(SystemExit):
-        matrix.main()
+        main(["run", "models", "paper", *words.split()])
     assert "--study" in capsys.readouterr().err
