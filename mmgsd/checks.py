@@ -6,6 +6,7 @@ import dataclasses
 import difflib
 import math
 import numbers
+import warnings
 from collections.abc import Collection
 from typing import Any
 
@@ -57,3 +58,14 @@ def check_types(config: Any) -> None:
             raise ValueError(f"{field.name} must be {'a finite float' if kind == 'float' else kind}, got {value!r}")
         if kind == "float":  # 1 and 1.0 are one configuration, with one digest
             object.__setattr__(config, field.name, float(value))
+
+
+def renamed(old: str, new: str) -> property:
+    """An attribute under its former name ``old``, which warns and gives that of the ``new`` one."""
+
+    def get(self: object) -> Any:
+        """The value under its present name."""
+        warnings.warn(f"{type(self).__name__}.{old} is called {new} now", DeprecationWarning, stacklevel=2)
+        return getattr(self, new)
+
+    return property(get)

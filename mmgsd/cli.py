@@ -20,7 +20,7 @@ from tqdm import tqdm
 import mmgsd
 from mmgsd.command import Option, describe_error
 from mmgsd.config import MAX_MODES, OBJECTS
-from mmgsd.files import write_bytes, writing
+from mmgsd.files import atomic_write, write_bytes
 from mmgsd.images import check_pixels, list_images, read_mask
 from mmgsd.match.camera import read_intrinsics
 from mmgsd.match.describe import describe_answer, format_query
@@ -356,8 +356,8 @@ def calibrate(
 
     calibrated = calibrate_weights if data else calibrate_unseen
     matcher = mmgsd.load(calibrated(weights, data or unseen, overwrite=overwrite))
-    found, reading = matcher.calibration, matcher.reading
-    print(f"{weights}: modes read with power {reading.power:g} and sharpness {reading.sharpness:g}; "
+    found, readout = matcher.calibration, matcher.readout
+    print(f"{weights}: modes read with power {readout.exponent:g} and sharpness {readout.mean_exponent:g}; "
           f"calibrated on {found.pairs} pairs of held-out simulations; each half by the other: "
           f"ECE {found.ece_ellipse:.3f} of ellipses, {found.ece_confidence:.3f} of confidences")  # fmt: skip
 
@@ -397,7 +397,7 @@ def draw_moves(look: Any, image: np.ndarray, moves: np.ndarray, path: Path) -> N
 
 def save_picture(figure: Any, path: Path) -> None:
     """A figure, as a file of the kind that its name ends with."""
-    with writing(path) as aside:
+    with atomic_write(path) as aside:
         figure.savefig(aside, format=path.suffix[1:].lower(), dpi=DPI, bbox_inches="tight", pad_inches=0.05)
 
 
@@ -477,7 +477,7 @@ def _list_rows(name: str, described: list[dict[str, Any]]) -> Iterator[dict[str,
 @contextmanager
 def _writing_rows(path: Path) -> Iterator[DictWriter]:
     """A writer of `COLUMNS` to a file that appears whole or not at all."""
-    with writing(path) as aside, open(aside, "w", newline="", encoding="utf-8", errors="backslashreplace") as file:
+    with atomic_write(path) as aside, open(aside, "w", newline="", encoding="utf-8", errors="backslashreplace") as file:
         table = DictWriter(file, COLUMNS, restval="")
         table.writeheader()
         yield table

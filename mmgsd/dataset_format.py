@@ -18,7 +18,7 @@ from mmgsd.files import ASIDE, DamagedFileError, ForeignFileError, read_json
 
 FORMAT = 1
 SPLITS = ("train", "test")
-TABLES = ("dataset.json", "labels.parquet")
+DATASET_FILES = ("dataset.json", "labels.parquet")
 REQUIRED_COLUMNS = ("file", "mask", "split", "episode", "view", "xy", "visible", "intrinsics", "camera_pose")
 REQUIRED_KEYS = ("format", "object", "size", "symmetry", "default_group", "config", "images", "versions")
 LARGEST = 8192  # px that a side of an image may have
@@ -112,7 +112,7 @@ def find_owner(folder: Path) -> Callable[[Path], bool]:
     def is_ours(path: Path) -> bool:
         """Whether this project writes a file of that path, relative to the data set."""
         name = path.as_posix()
-        own = name in TABLES or (name in named if named else RENDERED.fullmatch(name) is not None)
+        own = name in DATASET_FILES or (name in named if named else RENDERED.fullmatch(name) is not None)
         return own or ASIDE.fullmatch(path.name) is not None
 
     return is_ours
@@ -120,7 +120,7 @@ def find_owner(folder: Path) -> Callable[[Path], bool]:
 
 def is_member(name: str) -> bool:
     """Whether a path, with ``/`` between its parts, may be one of a data set's files."""
-    return name in TABLES or any(kind.fullmatch(name) for kind in (IMAGE, MASK))
+    return name in DATASET_FILES or any(kind.fullmatch(name) for kind in (IMAGE, MASK))
 
 
 def _is_description(path: Path) -> bool:

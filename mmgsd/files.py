@@ -50,7 +50,7 @@ class DamagedFileError(ValueError):
 
 
 @contextmanager
-def writing(path: Path | str) -> Iterator[Path]:
+def atomic_write(path: Path | str) -> Iterator[Path]:
     """Give a temporary path to write; it takes the place of ``path`` at the end, or is removed after an exception.
 
     Raises OSError, with ``path`` in its message, where the disk is full or the folder cannot be written.
@@ -117,7 +117,7 @@ def _copy_into(aside: Path, path: Path) -> None:
 
 def write_bytes(path: Path | str, data: bytes) -> Path:
     """Write a file whole or not at all; returns its path."""
-    with writing(path) as aside:
+    with atomic_write(path) as aside:
         aside.write_bytes(data)
     return Path(path)
 
@@ -164,7 +164,7 @@ def remove_leftovers(folder: Path, name: str = "") -> None:
             _remove(path)
 
 
-def set_aside(path: Path) -> Path:
+def quarantine(path: Path) -> Path:
     """Rename a damaged intermediate file so that it is made again; returns where it is now."""
     target = path.with_name(f"{path.name}.damaged")
     os.replace(path, target)
@@ -177,7 +177,7 @@ def is_kept(path: Path, is_wanted: Callable[[Path], Any]) -> bool:
     try:
         return path.is_file() and bool(is_wanted(path))
     except DamagedFileError:
-        set_aside(path)
+        quarantine(path)
         return False
 
 

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from mmgsd.checks import check_choice
-from mmgsd.files import scratch_folder, writing
+from mmgsd.files import atomic_write, scratch_folder
 from mmgsd.images import is_image, list_images, read_animation, read_image
 
 CODECS = {".mp4": "mp4v", ".webm": "VP80", ".avi": "MJPG"}  # of what is written
@@ -104,7 +104,7 @@ def writing_video(path: Path, rate: float) -> Iterator[Callable[[np.ndarray], No
             for writer in writers:
                 writer.release()
         if writers:
-            with writing(path) as aside:
+            with atomic_write(path) as aside:
                 os.replace(inside, aside)
 
 

@@ -156,7 +156,7 @@ def test_the_lines_of_python_run(monkeypatch: pytest.MonkeyPatch) -> None:
             if "images" in names:
                 names |= {"image0": names["images"][0], "image1": names["images"][1]}
                 names["mask1"] = names["image1"].any(-1)
-    assert names["match"].joint is not None and len(rendered) == 2
+    assert names["match"].joint_weights is not None and len(rendered) == 2
 
 
 @pytest.mark.parametrize(("name", "words"), [("README.md", 1000), ("data/results/README.md", 1500)])
@@ -189,8 +189,8 @@ def test_the_results_page_says_how_to_read_each_table_in_few_words() -> None:
     sections = page.split("\n## ")[1:]
     for section in sections:
         assert "*The paper*" in section and "```sh" in section, section[:40]
-        reading = section.partition("*How to read it*")[2].partition("\n\n")[0]
-        assert 0 < len(reading.split()) <= 80, section[:40]
+        readout = section.partition("*How to read it*")[2].partition("\n\n")[0]
+        assert 0 < len(readout.split()) <= 80, section[:40]
 
 
 def test_lessons_are_of_commits_and_of_rows_of_their_date() -> None:

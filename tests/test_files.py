@@ -21,7 +21,7 @@ def raising(number):
 
 def test_a_file_is_written_whole_or_not_at_all(tmp_path):
     path = files.write_text(tmp_path / "a" / "b.txt", "first")
-    with pytest.raises(RuntimeError, match="in the middle"), files.writing(path) as aside:
+    with pytest.raises(RuntimeError, match="in the middle"), files.atomic_write(path) as aside:
         aside.write_text("sec")
         raise RuntimeError("in the middle")
     assert path.read_text() == "first"
@@ -57,7 +57,7 @@ def test_what_cannot_be_written_is_said_before_the_work_and_stays(tmp_path):
     (tmp_path / "folder").mkdir()
     (tmp_path / "loop").symlink_to("loop")
     for name in ("folder", "loop"):
-        with pytest.raises(OSError, match=name), files.writing(tmp_path / name):
+        with pytest.raises(OSError, match=name), files.atomic_write(tmp_path / name):
             pytest.fail("the work is done for nothing")
     assert sorted(os.listdir(tmp_path)) == ["folder", "loop"] and (tmp_path / "loop").is_symlink()
 
@@ -155,7 +155,7 @@ def test_a_file_that_did_not_reach_the_disk_is_not_put_in_place(tmp_path, monkey
 
 def test_a_full_disk_names_the_path(tmp_path):
     def fill() -> None:
-        with files.writing(tmp_path / "big.bin"):
+        with files.atomic_write(tmp_path / "big.bin"):
             raise OSError(errno.ENOSPC, "No space left on device")
 
     with pytest.raises(OSError, match="No space left on device while writing .*big.bin") as caught:

@@ -34,7 +34,7 @@ from mmgsd.match.match import Match
 from mmgsd.measure.photographs import describe_marks
 from mmgsd.studies.models import get_label
 
-QUALITY = 90  # of what the browser is sent, JPEG
+JPEG_QUALITY = 90  # of what the browser is sent, JPEG
 DISPLAY_PX = 1600  # longer side of what the browser is sent
 HEAT_PX = 128  # longer side of the heatmap that it is sent, several times as fine as the descriptors
 BASELINE_PX = 640  # longer side of what hand-made descriptors see: their windows are made for images of this size
@@ -280,7 +280,7 @@ def show_answer(match: Match, scene: Scene) -> dict[str, Any]:
     truth = (scene.find_truth(xy).tolist() for xy in match.xy)
     points = [{"ellipses": shapes, "matches": true} for shapes, true in zip(ellipses, truth, strict=True)]
     shown = {"heat": np.rint(255 * heat).astype(np.uint8).tobytes(), "heat_size": list(size)}
-    joint = [] if match.joint is None else match.joint.astype(float).round(4).tolist()
+    joint = [] if match.joint_weights is None else match.joint_weights.astype(float).round(4).tolist()
     return shown | {"json": json.dumps(describe_answer(match)), "points": points, "joint": joint}
 
 
@@ -325,7 +325,7 @@ def _shrink(image: np.ndarray, longest: int) -> np.ndarray:
 
 def _encode(image: np.ndarray) -> bytes:
     """JPEG of a grey or BGR image."""
-    return cv2.imencode(".jpg", np.ascontiguousarray(image), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()
+    return cv2.imencode(".jpg", np.ascontiguousarray(image), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
 
 
 def _to_sentence(error: Exception) -> str:

@@ -41,8 +41,8 @@ class Scene:
         """True matches (n, 2) px of the material point nearest to a pixel (2,); none where it is far or unknown."""
         if self.xy0 is None:
             return np.empty((0, 2))
-        apart = np.linalg.norm(self.xy0 - xy, axis=1)
-        return self.orbits[int(apart.argmin())] if apart.min() <= SNAP_PX else np.empty((0, 2))
+        distance = np.linalg.norm(self.xy0 - xy, axis=1)
+        return self.orbits[int(distance.argmin())] if distance.min() <= SNAP_PX else np.empty((0, 2))
 
     def replace_image(self, side: int, image: np.ndarray, name: str) -> Scene:
         """The pair with another first (0) or second (1) image, of any kind that `Matcher.match` takes.

@@ -14,7 +14,7 @@ import onnxruntime
 import torch
 from torch import Tensor, nn
 
-from mmgsd.files import writing
+from mmgsd.files import atomic_write
 from mmgsd.match.matcher import Matcher
 from mmgsd.model.network import compute_input_size
 from mmgsd.numerics import own_numerics
@@ -22,6 +22,7 @@ from mmgsd.numerics import own_numerics
 TOLERANCE = {False: 1e-3, True: 1e-2}  # of an output, relative to its largest value; True: of weights in half precision
 HALVED = 64  # numbers from which on a tensor is worth halving
 STEP_PX = 8  # both sides of an input are multiples of it
+FIELDS = {"present": "presence"}  # of `Outputs`, by the name of what a file gives
 OUTPUTS = {  # what is exported of `Outputs`, and its axes that an image changes
     "descriptors": {0: "batch", 2: "rows", 3: "columns"},
     "mask": {0: "batch", 1: "mask_rows", 2: "mask_columns"},
@@ -58,7 +59,7 @@ def export_onnx(matcher: Matcher, path: Path | str, *, half: bool = False) -> fl
     generator = torch.Generator().manual_seed(0)
     shapes = ((2, height, width), (1, width, height + STEP_PX), (1, height + 2 * STEP_PX, width), (1, least, least))
     images = [torch.rand((count, 3, *size), generator=generator, dtype=torch.float32) for count, *size in shapes]
-    with writing(path) as aside:
+    with atomic_write(path) as aside:
         _write(network, images[0][:1], aside, _describe(matcher, (width, height)), half)
         difference = max(_compare(network, aside, image) for image in images)
         if not difference <= TOLERANCE[half]:
@@ -80,8 +81,8 @@ class _Described(nn.Module):
 
     def forward(self, image: Tensor) -> tuple[Tensor, ...]:
         """(B, 3, H, W) to the outputs of ``names``."""
-        said = [self.network.describe(_turn(image, k)) for k in range(self.turns)]
-        turned = [[getattr(one, name) for one in said] for name in self.names]
+        outputs = [self.network.describe(_turn(image, k)) for k in range(self.turns)]
+        turned = [[getattr(one, FIELDS.get(name, name)) for one in outputs] for name in self.names]
         return tuple(sum(_turn(value, -k) for k, value in enumerate(values)) / self.turns for values in turned)
 
 
@@ -109,7 +110,8 @@ def _turn(image: Tensor, quarters: int) -> Tensor:
 def _describe(matcher: Matcher, size: tuple[int, int]) -> dict[str, str]:
     """The file's metadata."""
     numbers = {"input_size": f"{size[0]} {size[1]}", "multiple_of": STEP_PX, "least_px": matcher.least_px,
-               "quarter_turns": matcher.turns, "modes": matcher.modes, "temperature": matcher.temperature}  # fmt: skip
+               "quarter_turns": matcher.turns, "modes": matcher.num_modes,
+               "temperature": matcher.temperature}  # fmt: skip
     if matcher.bandwidth is not None:
         numbers["bandwidth"] = matcher.bandwidth
     values = {"config": asdict(matcher.config)}

@@ -83,12 +83,12 @@ def make_page(matcher: Matcher, out: Path | str, *, name: str, runtime: Path | s
 
 def describe_model(matcher: Matcher, name: str) -> dict[str, Any]:
     """What the page's scripts know of a model beside its network, as plain values."""
-    config, calibration, reading = matcher.config, matcher.calibration, matcher.reading
+    config, calibration, readout = matcher.config, matcher.calibration, matcher.readout
     known = {"name": name, "size": matcher.size, "input_size": compute_input_size(matcher.size, config.input_px),
              "input_px": config.input_px, "least_px": matcher.least_px, "dim": config.descriptor_dim,
-             "modes": matcher.modes, "temperature": matcher.temperature, "bandwidth": matcher.bandwidth,
+             "modes": matcher.num_modes, "temperature": matcher.temperature, "bandwidth": matcher.bandwidth,
              "elsewhere_weight": heads.ELSEWHERE_WEIGHT, "looked_up": heads.LOOKED_UP, "beside": heads.BESIDE,
-             "radius_px": RADIUS_PX, "likely": LIKELY, "mixture": describe_mixture(reading), "calibration": None,
+             "radius_px": RADIUS_PX, "likely": LIKELY, "mixture": describe_mixture(readout), "calibration": None,
              "heat_colours": np.rint(255 * HEAT).astype(int).tolist()}  # fmt: skip
     if getattr(matcher.network, "heads", None):
         judge = matcher.network.heads.judge_layers
@@ -109,13 +109,13 @@ def _make_check(network: Path, least: int) -> dict[str, Any]:
             "tolerance": CHECK_TOLERANCE * float(np.abs(found).max())}  # fmt: skip
 
 
-def describe_mixture(reading: mixture.Reading) -> dict[str, Any]:
+def describe_mixture(readout: mixture.ModeReadout) -> dict[str, Any]:
     """How ``page/mixture.js`` fits, so that it is `mmgsd.match.mixture.fit_modes`."""
     names = {"annealing", "annealing_cycles", "cycles", "leap", "spread", "min_variance", "collapsed", "even",
              "prior_weight", "ellipse"}  # fmt: skip
     known = {name: getattr(mixture, name.upper()) for name in sorted(names)}
     known |= {"tolerance": mixture.TOLERANCE_CELLS, "kernel": mixture.KERNEL_CELLS}
-    return known | {"roundness": reading.roundness, "power": reading.power, "sharpness": reading.sharpness}
+    return known | {"roundness": readout.shape_prior, "power": readout.exponent, "sharpness": readout.mean_exponent}
 
 
 def _copy_samples(matcher: Matcher, folder: Path) -> list[str]:

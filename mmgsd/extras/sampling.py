@@ -28,12 +28,12 @@ from mmgsd.files import check_ours, locked, replace_folder, scratch_folder
 from mmgsd.images import encode_image, encode_mask
 from mmgsd.paths import Paths, find_root
 
-QUALITY = 50  # of WebP, 1 to 100
+WEBP_QUALITY = 50  # of WebP, 1 to 100
 LABEL_STEP = 1 / 16  # px that labels are rounded to
 SAMPLE = {"train": 16, "test": 8}  # images of a sample
 
 
-def write_sample(folder: Path, out: Path, *, quality: int = QUALITY) -> Path:
+def write_sample(folder: Path, out: Path, *, quality: int = WEBP_QUALITY) -> Path:
     """Copy a few images of ``folder``, of as many simulations as possible, into the data set ``out`` (replaced).
 
     ForeignFileError where ``out`` holds anything but a data set, LockedError while another process works on it.
@@ -93,7 +93,7 @@ def _read_quality(quality: int) -> int:
 
 
 def main(
-    preset: str = "paper", *, quality: Annotated[int, Option("of WebP, 1 to 100 (default: %(default)s)")] = QUALITY
+    preset: str = "paper", *, quality: Annotated[int, Option("of WebP, 1 to 100 (default: %(default)s)")] = WEBP_QUALITY
 ) -> None:
     """Sample both objects of a preset."""
     load_preset(preset)

@@ -15,7 +15,7 @@ import torch
 
 from mmgsd.command import Option
 from mmgsd.config import OBJECTS, TrainConfig, load_preset
-from mmgsd.files import DamagedFileError, ForeignFileError, is_kept, locked, set_aside, write_bytes, write_text
+from mmgsd.files import DamagedFileError, ForeignFileError, is_kept, locked, quarantine, write_bytes, write_text
 from mmgsd.measure.calibration import calibrate_weights
 from mmgsd.measure.evaluation import read_results
 from mmgsd.measure.shipped import SETS
@@ -97,7 +97,7 @@ def _check_replaceable(out: Path) -> None:
     try:
         note = load_metadata(out)
     except DamagedFileError:
-        set_aside(out)
+        quarantine(out)
         return
     if note.get("format") != "mmgsd-1":
         raise ForeignFileError(f"{out} holds no weights of this project: move it away, or choose another name")

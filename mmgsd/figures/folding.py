@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from mmgsd.figures.style import MARK, PAGE_IN, check_filled, make_grid, mark_pixel, styled
-from mmgsd.files import writing
+from mmgsd.files import atomic_write
 
 THUMBNAIL_PX, FRAME_PX = 160, 5  # sides of a picture, and of the frame that says whether it is a success
 WRAPPED, ACROSS = 13, 120  # letters of a line beside such a picture, and of the lines above a row of them
@@ -84,7 +84,7 @@ def save_slides(slides: Sequence[tuple[np.ndarray, np.ndarray]], path: Path) -> 
     """
     check_filled("slides", slides)
     frames = [Image.fromarray(np.hstack([crop_square(one, SLIDE_PX) for one in pair])) for pair in slides]
-    with writing(path) as aside:
+    with atomic_write(path) as aside:
         frames[0].save(aside, "WEBP", save_all=True, append_images=frames[1:], duration=SLIDE_MS, loop=0, quality=80)
     return path
 

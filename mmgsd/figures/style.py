@@ -19,7 +19,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
-from mmgsd.files import writing
+from mmgsd.files import atomic_write
 
 if TYPE_CHECKING:
     from mmgsd.match.match import Match
@@ -51,7 +51,7 @@ def save_figure(figure: Figure, path: Path, kinds: Sequence[str] = ("pdf", "png"
     for kind in kinds:
         metadata = {"CreationDate": None} if kind == "pdf" else None
         target = path.with_suffix(f".{kind}")
-        with matplotlib.rc_context(_STYLE), writing(target) as aside:
+        with matplotlib.rc_context(_STYLE), atomic_write(target) as aside:
             figure.savefig(aside, format=kind, dpi=200, metadata=metadata, bbox_inches="tight", pad_inches=0.01)
         written.append(target)
     return written

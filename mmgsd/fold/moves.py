@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from mmgsd.checks import check_choice
-from mmgsd.fold.agreement import (
+from mmgsd.fold.consensus import (
     RADIUS,
     Motion,
-    find_agreement,
+    assign_grasps,
+    find_consensus,
     find_extent,
     fit_motion_to,
-    settle_motion,
-    take_apart,
+    refine_motion,
 )
 from mmgsd.fold.demonstration import Demonstration, Look
 from mmgsd.match.match import Match
@@ -28,7 +28,7 @@ LEAST = 0.5  # share of the questions that must agree before a picture of a user
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
+class PolicyAnswer:
     """Moves (M, 2, 2) of the plane, pick and place; none where nothing agrees. ``motion`` is kept for later looks."""
 
     moves: np.ndarray
@@ -39,7 +39,7 @@ class Answer:
 def choose_moves(
     look: Look, match: Match, chosen: str, seen: Plane, shown: Plane, *, motion: Motion | None = None,
     free_scale: bool = False,
-) -> Answer:  # fmt: skip
+) -> PolicyAnswer:  # fmt: skip
     """Picks and places from the matches of a look's picks and anchors (`Look.asked`).
 
     ``seen`` and ``shown`` take pixels of the look's image and of the new one to the plane. "agree": the motion that
@@ -54,29 +54,29 @@ def choose_moves(
         surest = shown(match.best().xy)
         known = np.isfinite(surest).all(1)
         if not known[: len(picks)].all() or known.sum() < 2:
-            return Answer(np.zeros((0, 2, 2)), None, 0.0)
+            return PolicyAnswer(np.zeros((0, 2, 2)), None, 0.0)
         motion = fit_motion_to(asked[known], surest[known], free_scale=free_scale)
-        return Answer(np.stack([surest[: len(picks)], motion.apply(places)], 1), motion, float(known.mean()))
+        return PolicyAnswer(np.stack([surest[: len(picks)], motion.apply(places)], 1), motion, float(known.mean()))
     share, bent = 1.0, False
     if motion is None:
-        agreement = find_agreement(asked, modes, match.weights, free_scale=free_scale)
-        if agreement is None:
-            return Answer(np.zeros((0, 2, 2)), None, 0.0)
-        motion, share, bent = agreement.motion, agreement.share, agreement.share < RIGID
+        consensus = find_consensus(asked, modes, match.weights, free_scale=free_scale)
+        if consensus is None:
+            return PolicyAnswer(np.zeros((0, 2, 2)), None, 0.0)
+        motion, share, bent = consensus.motion, consensus.share, consensus.share < RIGID
     if bent:
-        motion = settle_motion(asked, modes, motion, free_scale=free_scale)
+        motion = refine_motion(asked, modes, motion, free_scale=free_scale)
     wanted = motion.apply(picks)  # (M, 2)
     radius = RADIUS * find_extent(asked) * abs(motion.factor)
-    grasped = take_apart(picks, modes[: len(picks)], motion, apart=radius)
+    grasped = assign_grasps(picks, modes[: len(picks)], motion, min_distance=radius)
     reach = np.inf if bent else 2 * radius
     with np.errstate(invalid="ignore"):
         near = np.linalg.norm(grasped - wanted, axis=1) <= reach  # not where it is NaN
-    return Answer(np.stack([np.where(near[:, None], grasped, wanted), motion.apply(places)], 1), motion, share)
+    return PolicyAnswer(np.stack([np.where(near[:, None], grasped, wanted), motion.apply(places)], 1), motion, share)
 
 
 def answer_picture(
     matcher: Matcher, demonstration: Demonstration, image: np.ndarray, *, look: int = 0, chosen: str = AGREE
-) -> Answer:
+) -> PolicyAnswer:
     """Moves (M, 2, 2) px in a picture (H, W, 3) uint8 of the present state, as one look of a demonstration made them.
 
     The picture is taken from about where the demonstration's was: a turn, a shift and a scale lead from one to the

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from mmgsd.files import DamagedFileError, writing
+from mmgsd.files import DamagedFileError, atomic_write
 
 UNREADABLE = (OSError, EOFError, ValueError, TypeError, KeyError, zipfile.BadZipFile, zlib.error)
 ABOUT = {"object", "task", "start", "ground", "seed", "fault", "look", "mark", "thickness"}
@@ -47,7 +47,7 @@ def write_state(path: Path, state: State) -> Path:
     """Write a state as a compressed ``.npz``, whole or not at all; equal states give equal bytes."""
     arrays = {field.name: getattr(state, field.name) for field in dataclasses.fields(state)}
     arrays["about"] = np.array(json.dumps(state.about, sort_keys=True))
-    with writing(path) as aside, open(aside, "wb") as file:
+    with atomic_write(path) as aside, open(aside, "wb") as file:
         np.savez_compressed(file, **arrays)
     return path
 

@@ -36,7 +36,7 @@ from mmgsd.files import (
 )
 from mmgsd.learn.augmentation import load_training_images, make_batch
 from mmgsd.learn.checkpoints import CHECKPOINT
-from mmgsd.learn.distributed import Team
+from mmgsd.learn.distributed import World
 from mmgsd.learn.objective import compute_head_loss, compute_loss, compute_place_loss
 from mmgsd.learn.photographs import add_points, check_photographs, join_batches, prepare_photographs, take
 from mmgsd.learn.training import Run, repeatable
@@ -286,7 +286,7 @@ class _Adaptation(Run):
     def __init__(self, job: _Job, chosen: list[int], folder: Path) -> None:
         self.job, self.chosen, self.folder, self.config = job, chosen, folder, job.config
         self.device, self.size = job.start.device, job.start.size
-        self.team = Team(self.device, (0,))
+        self.world = World(self.device, (0,))
         self.permutations = torch.tensor(job.permutations, device=self.device)
         self.own = take(job.own, chosen)
         marked = np.isin(chosen, job.marked)  # the two kinds are drawn as often as each other

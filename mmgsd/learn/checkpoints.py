@@ -15,7 +15,7 @@ from torch import Tensor
 
 from mmgsd.dataset import Dataset, join_datasets, load_parts
 from mmgsd.files import DamagedFileError, LockedError, locked, remove_leftovers
-from mmgsd.learn.distributed import Team
+from mmgsd.learn.distributed import World
 from mmgsd.model.tensors import WEIGHTS, load_metadata, read_tensors, write_tensors
 
 CHECKPOINT, LOG = "checkpoint.safetensors", "log.csv"
@@ -31,16 +31,16 @@ def is_trained(weights: Path, dataset: Path, *, also: str = "") -> bool:
 
 
 @contextmanager
-def held(folder: Path, team: Team) -> Iterator[None]:
-    """The folder, locked by the team's first process; LockedError in all of them where another run holds it."""
+def training_lock(folder: Path, world: World) -> Iterator[None]:
+    """The folder, locked by the world's first process; LockedError in all of them where another run holds it."""
     with ExitStack() as stack:
         refused = None
-        if team.rank == 0:
+        if world.rank == 0:
             try:
                 stack.enter_context(locked(folder, "training"))
             except LockedError as error:
                 refused = error
-        if team.add(float(refused is not None)):
+        if world.add(float(refused is not None)):
             raise refused or LockedError(f"{folder} is in use: the first process says by whom")
         yield
 

@@ -20,11 +20,11 @@ INTERFACES = ("GLOO_SOCKET_IFNAME", "NCCL_SOCKET_IFNAME")  # what names the netw
 
 
 @dataclass(frozen=True)
-class Team:
+class World:
     """The processes of a run, seen from one of them."""
 
     device: torch.device
-    groups: tuple[int, ...]  # of each batch, that are this process's own
+    batch_parts: tuple[int, ...]  # of each batch, that are this process's own
     rank: int = 0
     size: int = 1
 
@@ -53,8 +53,8 @@ class Team:
 
 
 @contextmanager
-def joined(groups: int, device: str) -> Iterator[Team]:
-    """The team that torchrun started, or this process alone; ValueError where it cannot share ``groups`` evenly."""
+def joined(groups: int, device: str) -> Iterator[World]:
+    """The world that torchrun started, or this process alone; ValueError where it cannot share ``groups`` evenly."""
     rank, size = (int(os.environ.get(name, default)) for name, default in (("RANK", 0), ("WORLD_SIZE", 1)))
     if groups % size:
         raise ValueError(f"groups must be a multiple of the {size} processes, got {groups}")
@@ -62,14 +62,14 @@ def joined(groups: int, device: str) -> Iterator[Team]:
     if place.type == "cuda" and size > 1:
         place = torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)))
         torch.cuda.set_device(place)
-    team = Team(place, tuple(range(rank, groups, size)), rank, size)
+    world = World(place, tuple(range(rank, groups, size)), rank, size)
     if size == 1:
-        yield team
+        yield world
         return
     with _on_this_machine():
         dist.init_process_group("nccl" if place.type == "cuda" else "gloo")
         try:
-            yield team
+            yield world
         finally:
             dist.destroy_process_group()
 

@@ -15,13 +15,13 @@ from mmgsd.model.heads import (
     SHARES,
     Heads,
     Outputs,
-    compute_judge_loss,
     compute_mask_loss,
-    compute_present_loss,
+    compute_presence_loss,
+    compute_visibility_loss,
 )
 from mmgsd.model.network import compute_cell_centres, compute_squared_distances, sample_descriptors
 
-JUDGED = 24  # source points of each image that are judged in another
+VISIBILITY_POINTS = 24  # source points of each image that are looked for in another
 
 
 def compute_sigma(config: TrainConfig, step: int) -> float:
@@ -55,9 +55,9 @@ def compute_loss(
         valid = valid & batch.askable[pair[1][:, None, None], orbit]  # as in Dense Object Nets: seen in both images
         there = sampled[pair[1][:, None, None], orbit, -config.descriptor_dim :]  # (K, Q, G, D)
         match = (source[:, :, None] - there).square().sum(-1)
-        far, apart = _sample_non_matches(config, target, batch, pair, source, modes, size, generator)
+        distance2, is_non_match = _sample_non_matches(config, target, batch, pair, source, modes, size, generator)
         function = losses.pcl if config.method == "pcl" else losses.spcl
-        return function((match + 1e-12).sqrt(), valid, (far + 1e-12).sqrt(), apart, margin=config.margin)
+        return function((match + 1e-12).sqrt(), valid, (distance2 + 1e-12).sqrt(), is_non_match, margin=config.margin)
     return _compute_mixture_loss(source, target[pair[1]], modes, valid, size, compute_sigma(config, step))
 
 
@@ -89,40 +89,42 @@ def _compute_mixture_loss(
 
 
 def compute_head_loss(
-    heads: Heads, said: Outputs, batch: Batch, permutations: Tensor, size: tuple[int, int], generator: torch.Generator
-) -> Tensor:
+    heads: Heads, outputs: Outputs, batch: Batch, permutations: Tensor, size: tuple[int, int],
+    generator: torch.Generator,
+) -> Tensor:  # fmt: skip
     """Weighted sum of the heads' losses on a batch of B images; ``permutations`` (G, P), ``size`` (width, height) px.
 
-    Every image's points are judged in the next image of the batch, at their true matches, moved a little, and at random
-    places. The descriptors are given to the judge as they are: its gradients do not reach them.
+    Every image's points are looked for in the next image of the batch, at their true matches, moved a little, and at
+    random places. The descriptors are given to the visibility head as they are: its gradients do not reach them.
     """
     losses = {
-        "mask": compute_mask_loss(said.mask, batch.mask.float()),
-        "present": compute_present_loss(said.present, batch.mask.flatten(1).any(1) | batch.inside.any(1)),
-        "judge": _compute_judge_loss(heads, said, batch, permutations, size, generator),
+        "mask": compute_mask_loss(outputs.mask, batch.mask.float()),
+        "presence": compute_presence_loss(outputs.presence, batch.mask.flatten(1).any(1) | batch.inside.any(1)),
+        "visibility": _compute_visibility_loss(heads, outputs, batch, permutations, size, generator),
     }
     return sum(SHARES[name] * loss for name, loss in losses.items())
 
 
-def _compute_judge_loss(
-    heads: Heads, said: Outputs, batch: Batch, permutations: Tensor, size: tuple[int, int], generator: torch.Generator
-) -> Tensor:
-    images, dim = len(batch.image), said.descriptors.shape[1] // heads.roles
-    points = torch.multinomial(batch.askable.float() + 1e-9, JUDGED, True, generator=generator)  # (B, Q)
+def _compute_visibility_loss(
+    heads: Heads, outputs: Outputs, batch: Batch, permutations: Tensor, size: tuple[int, int],
+    generator: torch.Generator,
+) -> Tensor:  # fmt: skip
+    images, dim = len(batch.image), outputs.descriptors.shape[1] // heads.roles
+    points = torch.multinomial(batch.askable.float() + 1e-9, VISIBILITY_POINTS, True, generator=generator)  # (B, Q)
     rows = torch.arange(images, device=points.device)
     known = batch.askable[rows[:, None], points]  # (B, Q)
-    source = sample_descriptors(said.descriptors.detach(), batch.xy[rows[:, None], points], size)[..., :dim]
-    target = rows.roll(1)  # image whose places are judged, of each source
+    source = sample_descriptors(outputs.descriptors.detach(), batch.xy[rows[:, None], points], size)[..., :dim]
+    target = rows.roll(1)  # image whose places are looked at, of each source
     orbit = permutations[:, points].permute(1, 2, 0)  # (B, Q, G)
     modes, other = batch.xy[target[:, None, None], orbit], batch.askable[target[:, None, None], orbit]
     seen = torch.cat([other, other.new_zeros(*other.shape[:2], ELSEWHERE)], -1)
     valid = torch.cat([batch.inside[target[:, None, None], orbit], other.new_ones(*other.shape[:2], ELSEWHERE)], -1)
     places = _draw_places(modes, size, generator)  # (B, Q, G + ELSEWHERE, 2)
-    there = torch.cat([said.descriptors.detach(), said.surface], 1)[target]
+    there = torch.cat([outputs.descriptors.detach(), outputs.surface], 1)[target]
     there = sample_descriptors(there, places.flatten(1, 2), size).view(*places.shape[:3], -1)
-    channels = said.descriptors.shape[1]
-    logits = heads.judge(source[:, :, None], there[..., :channels], there[..., channels:])
-    return compute_judge_loss(logits, seen, valid & known[..., None])
+    channels = outputs.descriptors.shape[1]
+    logits = heads.visibility(source[:, :, None], there[..., :channels], there[..., channels:])
+    return compute_visibility_loss(logits, seen, valid & known[..., None])
 
 
 def _draw_places(modes: Tensor, size: tuple[int, int], generator: torch.Generator) -> Tensor:

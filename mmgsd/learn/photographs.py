@@ -124,7 +124,7 @@ def _find_mask(matcher: Matcher, outputs: Outputs, photograph: Photograph, image
 
 def _find_sure(matcher: Matcher, image: np.ndarray, outputs: Outputs, mask: np.ndarray) -> np.ndarray:
     """Pixels with their matches in the same image (S, G, 2), each pixel first, where the model is sure of all."""
-    places, group = spread_places(mask > 0, ASKED), matcher.modes
+    places, group = spread_places(mask > 0, ASKED), matcher.num_modes
     if not len(places):
         return np.zeros((0, group, 2))
     answer = Pair(matcher, image, image, (outputs, outputs)).match(places)

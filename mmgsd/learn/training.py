@@ -20,17 +20,17 @@ from torch.utils import deterministic
 from mmgsd.checks import read_count, read_flag
 from mmgsd.config import CONTRASTIVE, DETAILED, MATCHES_OF_ONE, PASSES, TrainConfig
 from mmgsd.dataset import Dataset, hold_out, join_datasets, load_parts
-from mmgsd.files import DamagedFileError, saying_what_stays, set_aside, write_text
+from mmgsd.files import DamagedFileError, quarantine, saying_what_stays, write_text
 from mmgsd.learn import distributed
 from mmgsd.learn.augmentation import Batch, load_training_images, make_batch
 from mmgsd.learn.checkpoints import (
     CHECKPOINT,
     LOG,
     check_enough,
-    held,
     is_trained,
     read_checkpoint,
     remove_run,
+    training_lock,
     write_checkpoint,
 )
 from mmgsd.learn.objective import compute_head_loss, compute_loss
@@ -85,25 +85,25 @@ def train_model(
     parts = load_parts(dataset, "train", also=config.also)
     if parts[0].object != config.object:
         raise ValueError(f"object is {config.object!r}, but {dataset} shows a {parts[0].object}")
-    with distributed.joined(config.groups, find_device(device)) as team, held(folder, team), (
-        repeatable(team.device)
+    with distributed.joined(config.groups, find_device(device)) as world, training_lock(folder, world), (
+        repeatable(world.device)
     ):  # fmt: skip
         # by the process that held the folder before
         if not overwrite and is_trained(weights, dataset, also=config.also):
             return weights
-        run = Run(config, parts, folder, team, validate_every)  # what is wrong is said before anything is deleted
-        if overwrite and team.rank == 0:
+        run = Run(config, parts, folder, world, validate_every)  # what is wrong is said before anything is deleted
+        if overwrite and world.rank == 0:
             remove_run(folder)
-        team.wait()
+        world.wait()
         run.resume()
-        shown = progress and team.rank == 0
+        shown = progress and world.rank == 0
         bar = ProgressBar(range(run.step, config.steps), desc=config.name, disable=not shown, leave=False)
         with saying_what_stays(run.describe_kept):
             for _ in bar:
                 bar.set_postfix(loss=f"{run.advance():.3f}", refresh=False)
-            if team.rank == 0:
+            if world.rank == 0:
                 run.finish(weights)
-        team.wait()
+        world.wait()
     return weights
 
 
@@ -116,15 +116,15 @@ class Run:
     frozen_statistics = False  # of batch normalisation
 
     def __init__(
-        self, config: TrainConfig, parts: list[Dataset], folder: Path, team: distributed.Team, validate_every: int = 0
+        self, config: TrainConfig, parts: list[Dataset], folder: Path, world: distributed.World, validate_every: int = 0
     ) -> None:
-        self.config, self.folder, self.team, self.validate_every = config, folder, team, validate_every
+        self.config, self.folder, self.world, self.validate_every = config, folder, world, validate_every
         # the latter for calibration
         self.data, self.held_out = (join_datasets(*split) for split in zip(*map(hold_out, parts), strict=True))
         data = self.data
         check_enough(data, self.held_out)
-        self.device, self.size = team.device, data.size
-        device = team.device
+        self.device, self.size = world.device, data.size
+        device = world.device
         group = data.group(config.group)
         known = group.permutations[:1] if config.method in MATCHES_OF_ONE else group.permutations
         self.permutations = torch.tensor(known, device=device)
@@ -137,7 +137,7 @@ class Run:
         self.start(network, start, span=config.steps / 50)
 
     def start(self, network: torch.nn.Module, prototypes: Tensor, *, span: float) -> None:
-        """Before the first step; ``config``, ``folder``, ``team`` and ``device`` are set. ``span`` of the average."""
+        """Before the first step; ``config``, ``folder``, ``world`` and ``device`` are set. ``span`` of the average."""
         self.network = network.to(self.device, memory_format=torch.channels_last)
         # the average of the last steps' weights, statistics of batch normalisation included, is what is kept
         average = get_ema_multi_avg_fn(1 - 1 / max(2.0, span))
@@ -154,8 +154,8 @@ class Run:
         for optimiser in self.optimisers:
             optimiser.param_groups[0]["lr"] = compute_learning_rate(self.config, self.step)
             optimiser.zero_grad(set_to_none=True)
-        loss = self.team.add(sum(self.learn(group) for group in self.team.groups))
-        self.team.share_gradients([*self.trained, self.prototypes])
+        loss = self.world.add(sum(self.learn(group) for group in self.world.batch_parts))
+        self.world.share_gradients([*self.trained, self.prototypes])
         torch.nn.utils.clip_grad_norm_(self.trained, 5.0)
         for optimiser in self.optimisers:
             optimiser.step()
@@ -163,7 +163,7 @@ class Run:
         self.step += 1
         self.seconds += time.perf_counter() - start
         self.log.append({"step": self.step, "loss": loss, "seconds": round(self.seconds, 2)})
-        if self.team.rank == 0:
+        if self.world.rank == 0:
             self.keep()
         return loss
 
@@ -173,13 +173,13 @@ class Run:
         chosen = np.random.default_rng([seed, step]).choice(count, self.config.batch, count < self.config.batch)
         own = np.array_split(chosen, groups)[group]
         batch = make_batch(self.images, own, self.config, np.random.default_rng([seed, step, group]), self.device)
-        said = self.network.describe(batch.image.contiguous(memory_format=torch.channels_last))
-        loss = compute_loss(self.config, said.descriptors, batch, self.permutations, self.size, step, group)
+        outputs = self.network.describe(batch.image.contiguous(memory_format=torch.channels_last))
+        loss = compute_loss(self.config, outputs.descriptors, batch, self.permutations, self.size, step, group)
         if self.config.dense_weight:
-            loss = loss + self.config.dense_weight * self.compute_dense_loss(said.descriptors, batch)
+            loss = loss + self.config.dense_weight * self.compute_dense_loss(outputs.descriptors, batch)
         if self.config.heads:
             seeds = torch.Generator(self.device).manual_seed(-1 - (seed * 1_000_003 + step) * groups - group)
-            loss = loss + compute_head_loss(self.network.heads, said, batch, self.permutations, self.size, seeds)
+            loss = loss + compute_head_loss(self.network.heads, outputs, batch, self.permutations, self.size, seeds)
         (loss / groups).backward()
         return loss.item() / groups
 
@@ -232,13 +232,13 @@ class Run:
         """The folder's checkpoint, if there is one; the first process sets a damaged one aside before any goes on."""
         path, found = self.folder / CHECKPOINT, None
         like = {"prototypes": self.prototypes, **self._list_weights()}
-        if self.team.rank == 0 and path.is_file():
+        if self.world.rank == 0 and path.is_file():
             try:
                 found = read_checkpoint(path, like, str(self.device))
             except DamagedFileError:
-                set_aside(path)
-        self.team.wait()
-        if self.team.rank and path.is_file():
+                quarantine(path)
+        self.world.wait()
+        if self.world.rank and path.is_file():
             found = read_checkpoint(path, like, str(self.device))
         return found
 

@@ -25,7 +25,7 @@ from mmgsd.images import check_pixels, check_question
 from mmgsd.match.features import Extractor, extract_dinov2, extract_imagenet, sample_features
 from mmgsd.match.match import Match
 from mmgsd.match.matcher import fill_question, make_match
-from mmgsd.match.mixture import AS_IT_IS, Reading, check_modes
+from mmgsd.match.mixture import AS_IT_IS, ModeReadout, check_modes
 from mmgsd.numerics import own_numerics
 
 EXTRACTORS: dict[str, Extractor] = {"imagenet": extract_imagenet, "dinov2": extract_dinov2}
@@ -61,14 +61,14 @@ class FeatureMatcher:
 
     ``extractor`` makes (D, h, w) numbers, NumPy or torch, of an image (H, W, 3) uint8; their grid covers the whole
     image. What counts is the angle between two places' features. ``modes`` are returned unless a question says others,
-    read from the heatmap by ``reading``.
+    read from the heatmap by ``readout``.
     """
 
-    def __init__(self, extractor: Extractor, *, modes: int = 1, reading: Reading = AS_IT_IS) -> None:
+    def __init__(self, extractor: Extractor, *, modes: int = 1, readout: ModeReadout = AS_IT_IS) -> None:
         if not callable(extractor):
             raise ValueError(f"extractor must be a function of an image, got {extractor!r:.80}")
         check_modes(modes)
-        self.extractor, self.modes, self.reading = extractor, modes, reading
+        self.extractor, self.num_modes, self.readout = extractor, modes, readout
 
     def describe(self, image: np.ndarray, xy: np.ndarray) -> np.ndarray:
         """Descriptors (S, D) at pixels (S, 2); ValueError for an extractor that makes something else."""
@@ -90,7 +90,7 @@ class FeatureMatcher:
         image0, image1, points = check_question(image0, image1, xy)
         mask1 = np.ones(image1.shape[:2], bool) if mask1 is None else mask1
         cells, centres = self.compute_heatmaps(image0, image1, points, mask1)
-        return make_match(image0, image1, points, cells, centres, n, fitted=self.modes, reading=self.reading)
+        return make_match(image0, image1, points, cells, centres, n, fitted=self.num_modes, readout=self.readout)
 
     def match_many(self, questions: Iterable[tuple[Any, ...]], *, n: Any = None) -> Iterator[Match]:
         """As `Matcher.match_many`; what a mask0 says is not needed."""
@@ -100,9 +100,9 @@ class FeatureMatcher:
 class BaselineMatcher(FeatureMatcher):
     """The same of a method in `BASELINES` or `OPTIONAL`; ValueError for one not at hand."""
 
-    def __init__(self, method: str, *, modes: int = 1, reading: Reading = AS_IT_IS) -> None:
+    def __init__(self, method: str, *, modes: int = 1, readout: ModeReadout = AS_IT_IS) -> None:
         check_choice("method", method, (*BASELINES, *OPTIONAL))
-        super().__init__(EXTRACTORS.get(method, extract_imagenet), modes=modes, reading=reading)
+        super().__init__(EXTRACTORS.get(method, extract_imagenet), modes=modes, readout=readout)
         self.method = method
 
     def describe(self, image: np.ndarray, xy: np.ndarray) -> np.ndarray:

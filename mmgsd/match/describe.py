@@ -34,7 +34,7 @@ def _describe_mode(match: Match, query: int, k: int, confidence: np.ndarray) -> 
         "spread_px": round(float(match.spread_px[query, k]), 2),
         "confidence": round(float(confidence[query, k]), 4),
     }
-    if match.joint is not None:
+    if match.joint_weights is not None:
         mode["answer"] = int(k) + 1
     return mode if match.visible is None else {**mode, "visible": round(float(match.visible[query, k]), 4)}
 

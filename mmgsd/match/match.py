@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from mmgsd.checks import renamed
 from mmgsd.model.calibration import Calibration, Gaussian, Modes, compute_share
 from mmgsd.numerics import numpy_defaults
 
@@ -21,7 +22,7 @@ SHARED = (
     "image1",
     "scale",
     "calibration",
-    "joint",
+    "joint_weights",
 )  # fields of all queries; of others the first axis counts queries
 
 
@@ -47,17 +48,17 @@ class Match:
 
     ``image0``, ``image1``  (H, W, 3) uint8 RGB each.
     ``xy``  (S, 2) px in image0.
-    ``modes``  (S, n, 2) px in image1, most probable first, or as ``joint`` says; NaN for absent ones.
+    ``modes``  (S, n, 2) px in image1, most probable first, or as ``joint_weights`` says; NaN for absent ones.
     ``weights``  (S, n), sum to 1 over the modes that are here, also where fewer were kept than fitted.
     ``covariances``  (S, n, 2, 2) px².
     ``entropy``  (S,) nats, of the density over px of a training image, whatever the size of image1.
-    ``outside``  (S,) in [0, 1], heatmap mass outside the 95 % ellipses of all modes that were fitted.
+    ``outlier_mass``  (S,) in [0, 1], heatmap mass outside the 95 % ellipses of all modes that were fitted.
     ``cells``  (S, h, w), the heatmap on the descriptors' grid; each sums to 1.
     ``visible``  (S, n) in [0, 1], whether each mode's match is seen there, or hidden.
     ``on_object``  (S,) in [0, 1], whether the pixel asked about shows the object.
     ``absent``  (S,) in [0, 1], whether image1 does not show the object at all.
-    ``joint``  (n,) of a joint answer: modes[:, g] are of one member of the symmetry, and weigh so much over the whole
-    object, on average; the heaviest first. None: each query has an order of its own.
+    ``joint_weights``  (n,) of a joint answer: modes[:, g] are of one member of the symmetry, and weigh so much over the
+    whole object, on average; the heaviest first. None: each query has an order of its own.
     ``scale``  px of image1 by px of an image of the size that the model was taught with.
     ``calibration``  what ellipses, radii and confidences promise; None: what a Gaussian would.
 
@@ -72,14 +73,17 @@ class Match:
     weights: np.ndarray
     covariances: np.ndarray
     entropy: np.ndarray
-    outside: np.ndarray
+    outlier_mass: np.ndarray
     cells: np.ndarray
     visible: np.ndarray | None = None
     on_object: np.ndarray | None = None
     absent: np.ndarray | None = None
-    joint: np.ndarray | None = None
+    joint_weights: np.ndarray | None = None
     scale: float = 1.0
     calibration: Calibration | None = None
+
+    outside = renamed("outside", "outlier_mass")
+    joint = renamed("joint", "joint_weights")
 
     @cached_property
     def heatmap(self) -> np.ndarray:
@@ -141,8 +145,8 @@ class Match:
     @property
     def _measured(self) -> Modes:
         """In px of a training image."""
-        extent = np.exp(self.entropy.astype(float) / 2)[:, None]
-        return Modes(self.spread_px / self.scale, compute_share(self.weights), extent)
+        effective_size_px = np.exp(self.entropy.astype(float) / 2)[:, None]
+        return Modes(self.spread_px / self.scale, compute_share(self.weights), effective_size_px)
 
     @property
     def _promise(self) -> Gaussian:
@@ -162,7 +166,7 @@ class Match:
         rows = np.arange(len(self.modes))
         spread = np.nan_to_num(self.spread_px, nan=np.inf)
         hidden = np.zeros(spread.shape, bool) if self.visible is None else self.visible < 0.5
-        if self.joint is not None and len(self):
+        if self.joint_weights is not None and len(self):
             spread, hidden = (np.broadcast_to(values.mean(0), spread.shape) for values in (spread, hidden))
         chosen = np.lexsort((spread, hidden), axis=1)[:, 0]
         confidence = self.confidence(radius_px=radius_px)[rows, chosen]
@@ -176,7 +180,7 @@ class Match:
         Of what does not know what is seen it is the answer itself. ValueError for a joint answer, whose columns belong
         together.
         """
-        if self.joint is not None:
+        if self.joint_weights is not None:
             raise ValueError("a joint answer's modes must stay in its order: ask without joint, or sort match.modes")
         if self.visible is None:
             return self
@@ -245,7 +249,7 @@ def sort_modes(match: Match, order: np.ndarray, joint: np.ndarray) -> Match:
     weights = taken["weights"]
     total = weights.sum(1, keepdims=True)
     taken["weights"] = np.divide(weights, total, out=weights, where=total > 0)
-    return dataclasses.replace(match, **taken, joint=joint / joint.sum())
+    return dataclasses.replace(match, **taken, joint_weights=joint / joint.sum())
 
 
 def _take_modes(match: Match, order: np.ndarray) -> dict[str, np.ndarray | None]:

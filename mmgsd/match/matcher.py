@@ -16,12 +16,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mmgsd.checks import read_flag
+from mmgsd.checks import read_flag, renamed
 from mmgsd.config import CONTRASTIVE, OBJECTS, TrainConfig
 from mmgsd.images import check_aspect, check_mask, check_pixels, to_rgb
 from mmgsd.match.joint import join, spread_places
 from mmgsd.match.match import Match, sort_modes
-from mmgsd.match.mixture import AS_IT_IS, Mixture, Reading, check_count, check_modes, fit_modes, keep_most_probable
+from mmgsd.match.mixture import AS_IT_IS, Mixture, ModeReadout, check_count, check_modes, fit_modes, keep_most_probable
 from mmgsd.match.places import Flat, Place, lay_flat
 from mmgsd.model.calibration import Calibration
 from mmgsd.model.heads import Outputs, look_up, weigh_cells
@@ -85,13 +85,16 @@ class Matcher:
         _check_size(size)
         self.device = torch.device(find_device(device))
         self.network = network.eval().to(self.device, memory_format=torch.channels_last)
-        self.config, self.modes, self.size = config, modes, size
+        self.config, self.num_modes, self.size = config, modes, size
         self.object = config.object  # "" where a file of weights does not say
         self.temperature, self.calibration = temperature, calibration
-        self.reading = Reading(config.roundness, power, sharpness)
+        self.readout = ModeReadout(config.roundness, power, sharpness)
         self.turns = QUARTERS if config.rotate else 1  # what was trained upright knows only upright images
         self.bandwidth = config.margin / 4 if bandwidth is None and config.method in CONTRASTIVE else bandwidth
         self.places = places  # (P, D) what the object's material points are described as, None where that is not known
+
+    modes = renamed("modes", "num_modes")
+    reading = renamed("reading", "readout")
 
     @classmethod
     @own_numerics(gradients=True)
@@ -144,8 +147,8 @@ class Matcher:
     def _say(self, batch: Tensor) -> Outputs:
         """The mean of what the network says of images after each quarter turn, turned back."""
         turns = (batch.rot90(k, (2, 3)).contiguous(memory_format=torch.channels_last) for k in range(self.turns))
-        said = [self.network.describe(turned).turn(-k) for k, turned in enumerate(turns)]
-        return Outputs.mean(said)
+        outputs = [self.network.describe(turned).turn(-k) for k, turned in enumerate(turns)]
+        return Outputs.mean(outputs)
 
     @own_numerics()
     def compute_heatmaps(
@@ -183,7 +186,7 @@ class Matcher:
         there = sample_descriptors(there, places.flatten(0, 1)[None], sizes[1])[0].unflatten(0, modes.shape[:2])
         channels = len(said1.descriptors)
         source = self.sample_sources(said0, xy, sizes[0])[0][:, None]  # (S, 1, D)
-        logits = self.network.heads.judge(source, there[..., :channels], there[..., channels:])
+        logits = self.network.heads.visibility(source, there[..., :channels], there[..., channels:])
         return torch.sigmoid(logits) * modes.isfinite().all(-1).to(logits.device)
 
     def segment(self, image: Any) -> np.ndarray:
@@ -366,7 +369,7 @@ class Pair:
     matcher: Matcher
     image0: np.ndarray | None  # (H0, W0, 3) uint8; None: it is asked about places
     image1: np.ndarray  # (H1, W1, 3) uint8
-    said: tuple[Outputs | None, Outputs]
+    outputs: tuple[Outputs | None, Outputs]
     mask0: np.ndarray | None = None  # (H0, W0) bool, of the caller's
     mask1: np.ndarray | None = None  # (H1, W1) bool
 
@@ -379,7 +382,7 @@ class Pair:
         points = check_pixels(xy, self.image0.shape[1::-1])
         if not joint:
             return self._match(points, n)
-        count = check_answers(self.matcher.modes if n is None else n, self.matcher.modes)
+        count = check_answers(self.matcher.num_modes if n is None else n, self.matcher.num_modes)
         match, order = self.match_everywhere(points)
         weights = np.take_along_axis(match.weights, order, 1)
         heavy = weights[len(points) if len(match) > len(points) else 0 :].sum(0) + 1e-9
@@ -398,40 +401,40 @@ class Pair:
 
     def _find(self, places: Any, n: Any, joint: bool) -> Match:
         flat, xy, counts = self.matcher.look_up_places(places, joint=joint)
-        asked = dataclasses.replace(self, image0=flat.image, said=(flat.outputs, self.said[1]), mask0=flat.mask)
+        asked = dataclasses.replace(self, image0=flat.image, outputs=(flat.outputs, self.outputs[1]), mask0=flat.mask)
         return asked.match(xy, n=counts if n is None and not joint else n, joint=joint)
 
     def _find_mask(self) -> np.ndarray:
         """(H0, W0) bool, where image0 shows the object."""
         if self.mask0 is not None:
             return self.mask0
-        if self.said[0].mask is None:
+        if self.outputs[0].mask is None:
             raise ValueError("joint must be False, or mask0 be given: these weights of "
                              f"{self.matcher.config.name} learnt no mask")  # fmt: skip
-        return self.matcher.resize_mask(self.said[0].mask, self.image0.shape[1::-1]) >= 0.5
+        return self.matcher.resize_mask(self.outputs[0].mask, self.image0.shape[1::-1]) >= 0.5
 
     def _match(self, points: np.ndarray, n: Any, *, merge: bool = True) -> Match:
         size0, size1 = sizes = tuple((im.shape[1], im.shape[0]) for im in (self.image0, self.image1))
         mask1 = None if self.mask1 is None else torch.from_numpy(self.mask1)
-        cells = self.matcher.compute_heatmaps(*self.said, torch.from_numpy(points), size0, mask1=mask1)
+        cells = self.matcher.compute_heatmaps(*self.outputs, torch.from_numpy(points), size0, mask1=mask1)
         centres = compute_cell_centres(size1, cells.shape[-2:])
-        fitted, reading = self.matcher.modes, self.matcher.reading
+        fitted, readout = self.matcher.num_modes, self.matcher.readout
         scale = compute_scale(size1, self.matcher.size)
-        match = make_match(self.image0, self.image1, points, cells, centres, n, fitted=fitted, reading=reading,
+        match = make_match(self.image0, self.image1, points, cells, centres, n, fitted=fitted, readout=readout,
                            scale=scale, merge=merge)  # fmt: skip
         return dataclasses.replace(match, calibration=self.matcher.calibration, **self._look(match, sizes))
 
     def _look(self, match: Match, sizes: tuple[tuple[int, int], ...]) -> dict[str, np.ndarray]:
         """What is known of the object's presence: ``visible``, ``on_object`` and ``absent`` of a match."""
         known, xy = {}, torch.from_numpy(match.xy)
-        visible = self.matcher.compute_visible(*self.said, xy, torch.from_numpy(match.modes), sizes)
+        visible = self.matcher.compute_visible(*self.outputs, xy, torch.from_numpy(match.modes), sizes)
         if visible is not None:
             known["visible"] = visible.cpu().numpy()
-        on_object = look_up(self.mask0, self.said[0].mask, match.xy, sizes[0])
+        on_object = look_up(self.mask0, self.outputs[0].mask, match.xy, sizes[0])
         if on_object is not None:
             known["on_object"] = on_object
-        if self.mask1 is not None or self.said[1].present is not None:
-            absent = 0.0 if self.mask1 is not None else float(1 - self.said[1].present.sigmoid())
+        if self.mask1 is not None or self.outputs[1].presence is not None:
+            absent = 0.0 if self.mask1 is not None else float(1 - self.outputs[1].presence.sigmoid())
             known["absent"] = np.full(len(match), absent, np.float32)
         return known
 
@@ -466,7 +469,7 @@ def fill_question(question: Iterable[Any]) -> tuple[Any, Any, Any, Any, Any]:
 
 def make_match(
     image0: np.ndarray, image1: np.ndarray, xy: np.ndarray, cells: Tensor, centres: tuple[Tensor, Tensor], n: Any, *,
-    fitted: int = 1, reading: Reading = AS_IT_IS, scale: float = 1.0, merge: bool = True,
+    fitted: int = 1, readout: ModeReadout = AS_IT_IS, scale: float = 1.0, merge: bool = True,
 ) -> Match:  # fmt: skip
     """The answer that heatmaps (S, h, w) with cell ``centres`` (w,), (h,) px hold, however they were made.
 
@@ -476,9 +479,9 @@ def make_match(
     """
     wanted = check_count(fitted if n is None else n, "n", queries=len(cells))
     fit, entropy = read_heatmap(cells, "auto" if wanted is None else wanted.clamp(min=fitted), centres,
-                                reading=reading, merge=merge)  # fmt: skip
+                                readout=readout, merge=merge)  # fmt: skip
     fit = fit if wanted is None else keep_most_probable(fit, wanted)
-    arrays = (t.cpu().numpy() for t in (fit.modes, fit.weights, fit.covariances, entropy, fit.outside, cells))
+    arrays = (t.cpu().numpy() for t in (fit.modes, fit.weights, fit.covariances, entropy, fit.outlier_mass, cells))
     match = Match(image0, image1, xy, *arrays, scale=scale)
     return dataclasses.replace(match, entropy=match.entropy - np.float32(2 * math.log(scale)))
 
@@ -500,13 +503,13 @@ def compute_scale(size: tuple[int, int], trained: tuple[int, int]) -> float:
 
 
 def read_heatmap(
-    heatmap: Tensor, n: int | str | Tensor, centres: tuple[Tensor, Tensor], *, reading: Reading = AS_IT_IS,
+    heatmap: Tensor, n: int | str | Tensor, centres: tuple[Tensor, Tensor], *, readout: ModeReadout = AS_IT_IS,
     merge: bool = False,
 ) -> tuple[Mixture, Tensor]:  # fmt: skip
     """Mixtures of ``n`` modes and entropies (S,) in nats of heatmaps (S, h, w) with cell ``centres`` (w,), (h,) px."""
     xs, ys = (c.float().to(heatmap.device) for c in centres)
     entropy = compute_entropy(heatmap.flatten(1), float((xs[1] - xs[0]) * (ys[1] - ys[0])))
-    return fit_modes(heatmap, n, xs, ys, reading=reading, merge=merge), entropy
+    return fit_modes(heatmap, n, xs, ys, readout=readout, merge=merge), entropy
 
 
 def _check_size(size: tuple[int, int]) -> None:

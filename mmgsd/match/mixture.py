@@ -8,7 +8,7 @@ numbers of every cell, and an M-step, which needs their means, another. Where mo
 creeps: SQUAREM (Varadhan and Roland, Scandinavian Journal of Statistics 2008) leaps.
 
 Of an image unlike those that a network was taught with, part of the heatmap spreads over all of the object, and draws
-modes away from its peaks. `Reading` says how far modes follow the peaks instead.
+modes away from its peaks. `ModeReadout` says how far modes follow the peaks instead.
 """
 
 from __future__ import annotations
@@ -41,27 +41,27 @@ ELLIPSE = 5.991  # squared Mahalanobis distance of the ellipse that holds 95 % o
 
 
 @dataclass(frozen=True)
-class Reading:
+class ModeReadout:
     """How modes are read from a heatmap; ValueError, which names it, for another value.
 
-    ``roundness``: heatmap mass by which modes are a priori round and equally wide, greater than 0. ``power``, at least
-    1: they are fitted to the heatmap raised to it. ``sharpness``, at least 1: each then lies at the mean of its share
-    of the heatmap raised to it. Weights and covariances are those of the shares of the heatmap itself.
+    ``shape_prior``: heatmap mass by which modes are a priori round and equally wide, greater than 0. ``exponent``,
+    at least 1: they are fitted to the heatmap raised to it. ``mean_exponent``, at least 1: each then lies at the mean
+    of its share of the heatmap raised to it. Weights and covariances are those of the shares of the heatmap itself.
     """
 
-    roundness: float = ROUNDNESS
-    power: float = 1.0
-    sharpness: float = 1.0
+    shape_prior: float = ROUNDNESS
+    exponent: float = 1.0
+    mean_exponent: float = 1.0
 
     def __post_init__(self) -> None:
-        if not 0 < self.roundness < math.inf:
-            raise ValueError(f"roundness must be greater than 0, got {self.roundness!r}")
-        for name in ("power", "sharpness"):
+        if not 0 < self.shape_prior < math.inf:
+            raise ValueError(f"shape_prior must be greater than 0, got {self.shape_prior!r}")
+        for name in ("exponent", "mean_exponent"):
             if not 1 <= getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)!r}")
 
 
-AS_IT_IS = Reading()  # modes at the means of their shares
+AS_IT_IS = ModeReadout()  # modes at the means of their shares
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class Mixture:
     modes: Tensor  # (S, N, 2) px
     weights: Tensor  # (S, N), sum to 1
     covariances: Tensor  # (S, N, 2, 2) px²
-    outside: Tensor  # (S,) mass of the heatmap outside every mode's 95 % ellipse
+    outlier_mass: Tensor  # (S,) mass of the heatmap outside every mode's 95 % ellipse
 
 
 @own_numerics()
@@ -82,20 +82,20 @@ def fit_modes(
     ys: Tensor,
     *,
     cycles: int = CYCLES,
-    reading: Reading = AS_IT_IS,
+    readout: ModeReadout = AS_IT_IS,
     merge: bool = False,
 ) -> Mixture:
     """Fit an n-modal Gaussian mixture to each heatmap by weighted expectation-maximisation.
 
     ``heatmap`` (S, h, w) not negative, ``n`` modes for all or (S,), or "auto" for what the Bayesian information
     criterion prefers; ``xs`` (w,) and ``ys`` (h,) cell centres in px. Symmetric modes are a priori equally likely,
-    round and equally wide, the latter two as far as ``reading`` says: that decides which cell belongs to which mode,
+    round and equally wide, the latter two as far as ``readout`` says: that decides which cell belongs to which mode,
     while the result holds the moments of the mass itself. With ``merge``, modes less than a cell apart are one, and
     the others absent. Raises ValueError for other shapes, ``n`` that is not from 1
     to `MAX_MODES`, another word, or values that are not finite.
     """
     n, n_max = _check_fit(heatmap, n, xs, ys)
-    how = cycles, reading.roundness
+    how = cycles, readout.shape_prior
     heatmap = heatmap.float()
     total = heatmap.flatten(1).sum(-1, keepdim=True)
     if not total.isfinite().all():
@@ -103,65 +103,65 @@ def fit_modes(
     mass = torch.where(total > 0, heatmap.flatten(1) / total.clamp(min=1e-30), 1 / (len(xs) * len(ys)))
     grid = heatmap.shape[1:]
     mass = _interpolate(mass, grid)
-    powered = _raise(mass, reading.power)
-    state = _choose_fit(powered, grid, *how) if n is None else _fit(powered, n, n_max, grid, *how)
-    state = _measure_shares(mass, state, grid, reading)
-    state = _merge(state) if merge else state
-    outside = _measure_outside(mass, state, grid)
-    order = state[..., 2].argsort(-1, descending=True)
-    state = state.gather(1, order[..., None].expand_as(state))
-    absent = (state[..., 2] == 0)[..., None]
+    powered = _raise(mass, readout.exponent)
+    params = _choose_fit(powered, grid, *how) if n is None else _fit(powered, n, n_max, grid, *how)
+    params = _measure_shares(mass, params, grid, readout)
+    params = _merge(params) if merge else params
+    outlier_mass = _measure_outliers(mass, params, grid)
+    order = params[..., 2].argsort(-1, descending=True)
+    params = params.gather(1, order[..., None].expand_as(params))
+    absent = (params[..., 2] == 0)[..., None]
     step = torch.stack([xs[1] - xs[0], ys[1] - ys[0]])  # px a cell
-    modes = state[..., :2] * step + torch.stack([xs.mean(), ys.mean()])
-    a, b, c = state[..., 3:].unbind(-1)
+    modes = params[..., :2] * step + torch.stack([xs.mean(), ys.mean()])
+    a, b, c = params[..., 3:].unbind(-1)
     covariances = torch.stack([torch.stack([a, b], -1), torch.stack([b, c], -1)], -2) * step[:, None] * step
     nan = torch.nan
     return Mixture(
-        modes.masked_fill(absent, nan), state[..., 2], covariances.masked_fill(absent[..., None], nan), outside
+        modes.masked_fill(absent, nan), params[..., 2], covariances.masked_fill(absent[..., None], nan), outlier_mass
     )
 
 
-# A fit's state is (S, N, 6): a component's mean x, y, weight and covariance [[a, b], [b, c]], all in cells and from the
+# A fit's parameters are (S, N, 6): a component's mean x, y, weight and covariance [[a, b], [b, c]], in cells, from the
 # grid's centre, so that one regularisation suits every image size. Weight 0 marks a component that a query has not.
 
 
-def _fit(mass: Tensor, n: Tensor, n_max: int, grid: tuple[int, int], cycles: int, roundness: float) -> Tensor:
-    """State of the fit to (S, C) mass; where a component collapsed, the likelier of that and one from the peaks."""
-    how = n_max, grid, cycles, roundness
-    state = _fit_from(ANNEALING, mass, n, *how)
-    weight = state[..., 2]
+def _fit(mass: Tensor, n: Tensor, n_max: int, grid: tuple[int, int], cycles: int, shape_prior: float) -> Tensor:
+    """Parameters of the fit to (S, C) mass; where a component collapsed, the likelier of it and one from the peaks."""
+    how = n_max, grid, cycles, shape_prior
+    params = _fit_from(ANNEALING, mass, n, *how)
+    weight = params[..., 2]
     poor = ((weight > 0) & (weight * n[:, None] < COLLAPSED)).any(1).nonzero()[:, 0]
     if not len(poor):
-        return state
+        return params
     mass, cells, again = mass[poor], _describe_cells(grid, mass.device), _fit_from((), mass[poor], n[poor], *how)
-    before, after = (_compute_log_likelihood(mass, each, cells, even=EVEN) for each in (state[poor], again))
-    state[poor[after > before]] = again[after > before]
-    return state
+    before, after = (_compute_log_likelihood(mass, each, cells, even=EVEN) for each in (params[poor], again))
+    params[poor[after > before]] = again[after > before]
+    return params
 
 
 def _fit_from(
     temperatures: tuple[float, ...], mass: Tensor, n: Tensor, n_max: int, grid: tuple[int, int], cycles: int,
-    roundness: float,
+    shape_prior: float,
 ) -> Tensor:  # fmt: skip
-    """State of the fit to (S, C) mass, flattened before, in chunks of queries: memory stays bounded."""
+    """Parameters of the fit to (S, C) mass, flattened before, in chunks of queries: memory stays bounded."""
     coarse, coarse_grid = _halve(mass, grid)
     size = _get_chunk(n_max, coarse)
     parts = zip(coarse.split(size), n.split(size), strict=True)
-    starts = [_anneal(temperatures, *part, n_max, coarse_grid, roundness) for part in parts]
-    state = torch.cat(starts) * mass.new_tensor([2, 2, 1, 4, 4, 4])
-    state[..., 0] += 0.5 * (grid[1] % 2)  # an odd grid was halved with a column, or a row, of nothing
-    state[..., 1] += 0.5 * (grid[0] % 2)
-    return _run_em(mass, state, _describe_cells(grid, mass.device), cycles, roundness)
+    starts = [_anneal(temperatures, *part, n_max, coarse_grid, shape_prior) for part in parts]
+    params = torch.cat(starts) * mass.new_tensor([2, 2, 1, 4, 4, 4])
+    params[..., 0] += 0.5 * (grid[1] % 2)  # an odd grid was halved with a column, or a row, of nothing
+    params[..., 1] += 0.5 * (grid[0] % 2)
+    return _run_em(mass, params, _describe_cells(grid, mass.device), cycles, shape_prior)
 
 
-def _merge(state: Tensor) -> Tensor:
+def _merge(params: Tensor) -> Tensor:
     """State where components less than a cell apart are one, with their moments together, and the others absent."""
-    mean, weight, covariance = state.split([2, 1, 3], -1)
+    mean, weight, covariance = params.split([2, 1, 3], -1)
     near = torch.cdist(mean, mean) < 1  # (S, N, N)
     into = torch.where(near, weight.mT, -1).argmax(-1)  # (S, N), the heaviest that is near
     for _ in range(2):
         into = into.gather(1, into)  # of a chain
-    share = F.one_hot(into, state.shape[1]).mT * weight.mT  # (S, N, N), of what each is merged from
+    share = F.one_hot(into, params.shape[1]).mT * weight.mT  # (S, N, N), of what each is merged from
     total = share.sum(-1, keepdim=True)
     share = share / total.clamp(min=1e-30)
     middle = share @ mean
@@ -178,22 +178,22 @@ def _raise(mass: Tensor, power: float) -> Tensor:
     return raised / raised.sum(-1, keepdim=True)
 
 
-def _measure_shares(mass: Tensor, state: Tensor, grid: tuple[int, int], reading: Reading) -> Tensor:
+def _measure_shares(mass: Tensor, params: Tensor, grid: tuple[int, int], readout: ModeReadout) -> Tensor:
     """State with the weights and covariances of the components' shares of the mass, and the means of sharper ones."""
-    if reading.power == reading.sharpness == 1:
-        return state
-    size, cells = _get_chunk(state.shape[1], mass), _describe_cells(grid, mass.device)
-    parts = zip(mass.split(size), state.split(size), strict=True)
-    return torch.cat([_measure_part(*part, cells, reading.sharpness) for part in parts])
+    if readout.exponent == readout.mean_exponent == 1:
+        return params
+    size, cells = _get_chunk(params.shape[1], mass), _describe_cells(grid, mass.device)
+    parts = zip(mass.split(size), params.split(size), strict=True)
+    return torch.cat([_measure_part(*part, cells, readout.mean_exponent) for part in parts])
 
 
-def _measure_part(mass: Tensor, state: Tensor, cells: Tensor, sharpness: float) -> Tensor:
-    found = _compute_moments(mass, state, cells)
-    share = torch.softmax(_compute_log_densities(state, cells), 1).mul_(mass[:, None])  # (S, N, C)
+def _measure_part(mass: Tensor, params: Tensor, cells: Tensor, sharpness: float) -> Tensor:
+    found = _compute_moments(mass, params, cells)
+    share = torch.softmax(_compute_log_densities(params, cells), 1).mul_(mass[:, None])  # (S, N, C)
     sharp = (share / share.amax(-1, keepdim=True).clamp(min=1e-30)) ** sharpness
     mean = (sharp @ cells[1:3].T) / sharp.sum(-1, keepdim=True).clamp(min=1e-9)
-    mean = torch.where(found[..., 2:3] > 1e-9, mean, state[..., :2])
-    return torch.cat([mean, state[..., 2:3], found[..., 3:]], -1)
+    mean = torch.where(found[..., 2:3] > 1e-9, mean, params[..., :2])
+    return torch.cat([mean, params[..., 2:3], found[..., 3:]], -1)
 
 
 def _get_chunk(n_max: int, mass: Tensor) -> int:
@@ -208,16 +208,16 @@ def _halve(mass: Tensor, grid: tuple[int, int]) -> tuple[Tensor, tuple[int, int]
 
 
 def _anneal(
-    temperatures: tuple[float, ...], mass: Tensor, n: Tensor, n_max: int, grid: tuple[int, int], roundness: float
+    temperatures: tuple[float, ...], mass: Tensor, n: Tensor, n_max: int, grid: tuple[int, int], shape_prior: float
 ) -> Tensor:
     """State at the peaks, then fitted to the flattened mass, less and less flattened."""
-    state, cells = _start(mass, n, n_max, grid), _describe_cells(grid, mass.device)
+    params, cells = _start(mass, n, n_max, grid), _describe_cells(grid, mass.device)
     for temperature in temperatures:
         flat = mass ** (1 / temperature)
         flat /= flat.sum(-1, keepdim=True)
         for _ in range(ANNEALING_CYCLES):
-            state = _run_cycle(flat, state, cells, roundness)
-    return state
+            params = _run_cycle(flat, params, cells, shape_prior)
+    return params
 
 
 def _interpolate(mass: Tensor, grid: tuple[int, int]) -> Tensor:
@@ -261,65 +261,65 @@ def _describe_cells(grid: tuple[int, int], device: torch.device) -> Tensor:
     return torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y])
 
 
-def _run_em(mass: Tensor, state: Tensor, cells: Tensor, cycles: int, roundness: float) -> Tensor:
+def _run_em(mass: Tensor, params: Tensor, cells: Tensor, cycles: int, shape_prior: float) -> Tensor:
     """Iterate until at rest; then the moments of each component's share of the mass, without the priors."""
-    size, moving = _get_chunk(state.shape[1], mass), torch.arange(len(mass), device=mass.device)
+    size, moving = _get_chunk(params.shape[1], mass), torch.arange(len(mass), device=mass.device)
     for _ in range(cycles):
         moved = []
         for part in moving.split(size):
-            after = _run_cycle(mass[part], state[part], cells, roundness)
-            moved.append((after - state[part])[..., :2].abs().amax((1, 2)) > TOLERANCE_CELLS)
-            state[part] = after
+            after = _run_cycle(mass[part], params[part], cells, shape_prior)
+            moved.append((after - params[part])[..., :2].abs().amax((1, 2)) > TOLERANCE_CELLS)
+            params[part] = after
         moving = moving[torch.cat(moved)]
         if not len(moving):
             break
-    parts = zip(mass.split(size), state.split(size), strict=True)
-    present, state = state[..., 2] > 0, torch.cat([_compute_moments(*part, cells) for part in parts])
-    state[..., 2] = torch.where(present, state[..., 2].clamp(min=1e-9), 0)  # 0 stays the mark of an absent one
-    return state
+    parts = zip(mass.split(size), params.split(size), strict=True)
+    present, params = params[..., 2] > 0, torch.cat([_compute_moments(*part, cells) for part in parts])
+    params[..., 2] = torch.where(present, params[..., 2].clamp(min=1e-9), 0)  # 0 stays the mark of an absent one
+    return params
 
 
-def _run_cycle(mass: Tensor, state: Tensor, cells: Tensor, roundness: float) -> Tensor:
+def _run_cycle(mass: Tensor, params: Tensor, cells: Tensor, shape_prior: float) -> Tensor:
     """Two EM steps, a leap as far as their change of pace suggests, and a step that steadies it."""
-    first = _step(mass, state, cells, roundness)
-    second = _step(mass, first, cells, roundness)
-    pace, change = first - state, second - 2 * first + state
+    first = _step(mass, params, cells, shape_prior)
+    second = _step(mass, first, cells, shape_prior)
+    pace, change = first - params, second - 2 * first + params
     length = pace.flatten(1).norm(dim=1) / change.flatten(1).norm(dim=1).clamp(min=1e-12)
     length = length.clamp(1, LEAP)[:, None, None]
-    leapt = state + 2 * length * pace + length**2 * change
+    leapt = params + 2 * length * pace + length**2 * change
     weight, a, b, c = leapt[..., 2:].unbind(-1)
     lawful = (a > MIN_VARIANCE) & (c > MIN_VARIANCE) & (a * c - b * b > MIN_VARIANCE**2) & (weight >= 0)
-    return _step(mass, torch.where(lawful.all(1)[:, None, None], leapt, second), cells, roundness)
+    return _step(mass, torch.where(lawful.all(1)[:, None, None], leapt, second), cells, shape_prior)
 
 
-def _step(mass: Tensor, state: Tensor, cells: Tensor, roundness: float) -> Tensor:
+def _step(mass: Tensor, params: Tensor, cells: Tensor, shape_prior: float) -> Tensor:
     """One step of EM with the priors."""
-    mean, weight, covariance = _compute_moments(mass, state, cells).split([2, 1, 3], -1)
+    mean, weight, covariance = _compute_moments(mass, params, cells).split([2, 1, 3], -1)
     width = 0.5 * (weight * covariance[..., ::2]).sum((1, 2)) / weight.sum((1, 2))  # (S,)
     average = width[:, None, None] * width.new_tensor([1.0, 0.0, 1.0])
-    covariance = (weight * covariance + roundness * average) / (weight + roundness)
-    weight = (weight + PRIOR_WEIGHT) * (state[..., 2:3] > 0)
+    covariance = (weight * covariance + shape_prior * average) / (weight + shape_prior)
+    weight = (weight + PRIOR_WEIGHT) * (params[..., 2:3] > 0)
     return torch.cat([mean, weight / weight.sum(1, keepdim=True), covariance], -1)
 
 
-def _compute_moments(mass: Tensor, state: Tensor, cells: Tensor) -> Tensor:
-    """State of the components' shares of the (S, C) mass: an E-step and an M-step."""
-    share = torch.softmax(_compute_log_densities(state, cells), 1).mul_(mass[:, None])  # (S, N, C)
+def _compute_moments(mass: Tensor, params: Tensor, cells: Tensor) -> Tensor:
+    """Parameters of the components' shares of the (S, C) mass: an E-step and an M-step."""
+    share = torch.softmax(_compute_log_densities(params, cells), 1).mul_(mass[:, None])  # (S, N, C)
     moments = share @ cells.T  # (S, N, 6)
     weight = moments[..., :1]
     mean, (xx, xy, yy) = moments[..., 1:3] / weight.clamp(min=1e-9), moments[..., 3:].unbind(-1)
-    mean = torch.where(weight > 1e-9, mean, state[..., :2])
+    mean = torch.where(weight > 1e-9, mean, params[..., :2])
     x, y = mean.unbind(-1)
     count = weight[..., 0].clamp(min=1e-9)
     a, b, c = xx / count - x * x, xy / count - x * y, yy / count - y * y
     covariance = torch.stack([a.clamp(min=MIN_VARIANCE) + 1e-3, b, c.clamp(min=MIN_VARIANCE) + 1e-3], -1)
-    covariance = torch.where(weight > 1e-9, covariance, state[..., 3:])
+    covariance = torch.where(weight > 1e-9, covariance, params[..., 3:])
     return torch.cat([mean, weight, covariance], -1)
 
 
-def _compute_log_densities(state: Tensor, cells: Tensor) -> Tensor:
+def _compute_log_densities(params: Tensor, cells: Tensor) -> Tensor:
     """ln(weight * density) of each component at each cell, (S, N, C), less the constant ln 2π."""
-    x, y, weight, a, b, c = state.unbind(-1)
+    x, y, weight, a, b, c = params.unbind(-1)
     determinant = a * c - b * b
     p, q, r = c / determinant, -b / determinant, a / determinant  # the inverse covariance [[p, q], [q, r]]
     at_origin = weight.log() - 0.5 * determinant.log() - 0.5 * (p * x * x + 2 * q * x * y + r * y * y)
@@ -327,40 +327,40 @@ def _compute_log_densities(state: Tensor, cells: Tensor) -> Tensor:
     return torch.stack([at_origin, p * x + q * y, q * x + r * y, -0.5 * p, -q, -0.5 * r], -1) @ cells
 
 
-def _compute_log_likelihood(mass: Tensor, state: Tensor, cells: Tensor, *, even: float = 0.0) -> Tensor:
+def _compute_log_likelihood(mass: Tensor, params: Tensor, cells: Tensor, *, even: float = 0.0) -> Tensor:
     """Mean log-density (S,) of the mass, each component wider by a cell's own spread: no spike between cells counts.
 
     The mixture may have a further part that is ``even`` over the grid.
     """
-    state = state + 2 * SPREAD[0] * state.new_tensor([0, 0, 0, 1, 0, 1])
-    size = _get_chunk(state.shape[1], mass)
-    parts = zip(mass.split(size), state.split(size), strict=True)
+    params = params + 2 * SPREAD[0] * params.new_tensor([0, 0, 0, 1, 0, 1])
+    size = _get_chunk(params.shape[1], mass)
+    parts = zip(mass.split(size), params.split(size), strict=True)
     floor = mass.new_tensor(2 * math.pi * even / mass.shape[1]).log()
     return torch.cat([(_compute_log_densities(s, cells).logsumexp(1).logaddexp(floor) * m).sum(-1) for m, s in parts])
 
 
-def _choose_fit(mass: Tensor, grid: tuple[int, int], cycles: int, roundness: float) -> Tensor:
+def _choose_fit(mass: Tensor, grid: tuple[int, int], cycles: int, shape_prior: float) -> Tensor:
     """State (S, 8, 6) with as many components as the Bayesian information criterion prefers."""
     cells, states, criteria = _describe_cells(grid, mass.device), [], []
     for n in range(1, MOST_MODES + 1):
-        state = _fit(mass, torch.full((len(mass),), n, device=mass.device), n, grid, cycles, roundness)
-        likelihood = SAMPLES * _compute_log_likelihood(mass, state, cells)
+        params = _fit(mass, torch.full((len(mass),), n, device=mass.device), n, grid, cycles, shape_prior)
+        likelihood = SAMPLES * _compute_log_likelihood(mass, params, cells)
         criteria.append((6 * n - 1) * float(np.log(SAMPLES)) - 2 * likelihood)
-        states.append(F.pad(state, (0, 0, 0, MOST_MODES - n)))
+        states.append(F.pad(params, (0, 0, 0, MOST_MODES - n)))
     best = torch.stack(criteria).argmin(0)  # (S,)
     return torch.stack(states)[best, torch.arange(len(mass), device=mass.device)]
 
 
-def _measure_outside(mass: Tensor, state: Tensor, grid: tuple[int, int]) -> Tensor:
+def _measure_outliers(mass: Tensor, params: Tensor, grid: tuple[int, int]) -> Tensor:
     """Mass (S,) outside every component's 95 % ellipse."""
     x, y = _describe_cells(grid, mass.device)[1:3]
-    outside = torch.ones_like(mass, dtype=torch.bool)
-    for component in state.unbind(1):
+    outlier_mass = torch.ones_like(mass, dtype=torch.bool)
+    for component in params.unbind(1):
         mean_x, mean_y, weight, a, b, c = component[..., None].unbind(1)  # (S, 1) each
         dx, dy = x - mean_x, y - mean_y
         inside = c * dx * dx - 2 * b * dx * dy + a * dy * dy <= ELLIPSE * (a * c - b * b)
-        outside &= ~inside | (weight == 0)
-    return (mass * outside).sum(-1)
+        outlier_mass &= ~inside | (weight == 0)
+    return (mass * outlier_mass).sum(-1)
 
 
 def _check_fit(heatmap: Tensor, n: int | str | Tensor, xs: Tensor, ys: Tensor) -> tuple[Tensor | None, int]:
@@ -418,4 +418,4 @@ def keep_most_probable(fit: Mixture, n: Tensor) -> Mixture:
         weights = weights / weights.sum(1, keepdim=True)
     modes = fit.modes[:, :most].masked_fill(absent[..., None], torch.nan)
     covariances = fit.covariances[:, :most].masked_fill(absent[..., None, None], torch.nan)
-    return Mixture(modes, weights, covariances, fit.outside)
+    return Mixture(modes, weights, covariances, fit.outlier_mass)

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from mmgsd.checks import check_choice
-from mmgsd.files import writing
+from mmgsd.files import atomic_write
 from mmgsd.match.match import LIKELY
 from mmgsd.match.track import Tracked
 from mmgsd.video import CODECS, writing_video
@@ -52,7 +52,7 @@ def recording(paths: list[Path], rate: float) -> Iterator[Record]:
 
 @contextmanager
 def _write_csv(path: Path, rate: float) -> Iterator[Callable[..., None]]:
-    with writing(path) as aside, open(aside, "w", newline="", encoding="utf-8") as file:
+    with atomic_write(path) as aside, open(aside, "w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
         table.writerow(COLUMNS)
 
@@ -68,7 +68,7 @@ def _write_csv(path: Path, rate: float) -> Iterator[Callable[..., None]]:
 @contextmanager
 def _write_json(path: Path, rate: float) -> Iterator[Callable[..., None]]:
     """One object, a line a frame."""
-    with writing(path) as aside, open(aside, "w", encoding="utf-8") as file:
+    with atomic_write(path) as aside, open(aside, "w", encoding="utf-8") as file:
         file.write(f'{{"frames_per_second": {rate:g}, "frames": [')
 
         def write(number: int, image: np.ndarray, tracked: Tracked) -> None:

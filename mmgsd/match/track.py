@@ -104,7 +104,7 @@ class Tracker:
         else:
             flat, self._points, counts = matcher.look_up_places(places, joint=True)
             self._image0, self._said0, self._mask0 = flat.image, flat.outputs, flat.mask
-            self._counts = np.full(len(self._points), matcher.modes) if counts is None else counts
+            self._counts = np.full(len(self._points), matcher.num_modes) if counts is None else counts
 
     def _begin(self, pair: Pair) -> None:
         """Where the points of the first picture lie there is known."""

@@ -24,7 +24,7 @@ from mmgsd.config import EvaluateConfig
 from mmgsd.dataset import Dataset, hold_out, join_datasets, load_dataset, load_parts, sample_pairs
 from mmgsd.match.matcher import Matcher
 from mmgsd.measure.questions import ask, choose_points, describe, measure_mean_error, model_answer
-from mmgsd.measure.reading import choose_reading
+from mmgsd.measure.readout import choose_readout
 from mmgsd.measure.uncertainty import (
     RADII_PX,
     compute_confidence_error,
@@ -80,7 +80,7 @@ def calibrate_unseen(
     """The same by the test images of data sets that were not trained on, from which a reading is chosen first.
 
     ``unseen`` are their folders, one or more, of other seeds than those that the weights are measured on. The reading
-    (`mmgsd.measure.reading.choose_reading`) is kept as ``power`` and ``sharpness``, the fingerprints as ``unseen``.
+    (`mmgsd.measure.readout.choose_readout`) is kept as ``power`` and ``sharpness``, the fingerprints as ``unseen``.
     Errors are those of `calibrate_weights`, and ValueError where a data set is that of the training.
     """
     overwrite, weights = read_flag("overwrite", overwrite), Path(weights)
@@ -93,9 +93,9 @@ def calibrate_unseen(
             raise ValueError(f"unseen must be data sets that {weights} was not trained on, got that: {part.folder}")
     data = join_datasets(*parts)
     how = {"points": points, "progress": progress}
-    reading = choose_reading(matcher, data, progress=read_flag("progress", progress))
+    readout = choose_readout(matcher, data, progress=read_flag("progress", progress))
     found = _calibrate(matcher, data, "unseen must hold test", pairs=pairs, **how)
-    chosen = {"power": repr(reading.power), "sharpness": repr(reading.sharpness)}
+    chosen = {"power": repr(readout.exponent), "sharpness": repr(readout.mean_exponent)}
     note = {**chosen, "calibration": found, "unseen": json.dumps([p.fingerprint for p in parts])}
     return _keep(weights, note, describe_places(matcher, data))
 
@@ -193,7 +193,7 @@ def find_quantiles(scores: np.ndarray, pair: np.ndarray) -> np.ndarray:
 
 
 def fit_powers(modes: Modes, distance: np.ndarray) -> tuple[float, ...]:
-    """Powers (3,) of M modes' spread, share and extent in what their ``distance`` (M,) px is measured by.
+    """Powers (3,) of M modes' spread, share and effective size in what their ``distance`` (M,) px is measured by.
 
     A logistic model tells of each radius of `RADII_PX` whether the distance is within it, from the logarithms of all;
     the most likely one's slopes, by the radius', are the powers.

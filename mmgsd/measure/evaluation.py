@@ -15,12 +15,12 @@ from mmgsd.checks import read_count, read_flag
 from mmgsd.config import EvaluateConfig, digest
 from mmgsd.dataset import Dataset, load_dataset
 from mmgsd.dataset_format import UNREADABLE
-from mmgsd.files import DamagedFileError, is_kept, read_json, saying_what_stays, write_json, writing
+from mmgsd.files import DamagedFileError, atomic_write, is_kept, read_json, saying_what_stays, write_json
 from mmgsd.match.baselines import BASELINES, OPTIONAL, BaselineMatcher
 from mmgsd.match.matcher import Matcher, check_scales, read_heatmap
-from mmgsd.match.mixture import AS_IT_IS, Mixture, Reading, check_modes
+from mmgsd.match.mixture import AS_IT_IS, Mixture, ModeReadout, check_modes
 from mmgsd.measure.metrics import aggregate
-from mmgsd.measure.questions import Answer, ask, model_answer
+from mmgsd.measure.questions import AnswerFunction, ask, model_answer
 
 CHANCE = ("centre", "random")
 ASKED = ["pair", "image0", "image1", "point", "visible", "n", "hidden"]  # columns that are the same for all methods
@@ -29,7 +29,8 @@ MEASURES = "3"  # to be raised where the same answers are measured in another wa
 
 def evaluate_model(
     weights: Path, dataset: Path, config: EvaluateConfig, out: Path, *, group: str = "", modes: int = 0,
-    temperature: float | None = None, reading: Reading | None = None, overwrite: bool = False, progress: bool = True,
+    temperature: float | None = None, readout: ModeReadout | None = None, overwrite: bool = False,
+    progress: bool = True,
 ) -> Path:  # fmt: skip
     """Ask a trained model all queries and write the table ``out`` (Parquet).
 
@@ -37,7 +38,7 @@ def evaluate_model(
 
     The true matches are those of ``group`` ("" is the object's own), whatever the model was taught. As many modes are
     fitted as a query has true matches, but at least ``modes``: of these the most probable ones are the answer.
-    ``temperature`` of the heatmaps is the model's own, calibrated one unless given, and so is the ``reading`` of their
+    ``temperature`` of the heatmaps is the model's own, calibrated one unless given, and so is the ``readout`` of their
     modes. ValueError for ``modes`` that are not from 0 to `mmgsd.config.MAX_MODES`, for another ``temperature`` than a
     number above 0, and for weights that were taught another object than the data set shows.
     """
@@ -50,37 +51,37 @@ def evaluate_model(
     method = hashlib.sha256(Path(weights).read_bytes()).hexdigest()
     method += "" if temperature is None else f" at temperature {temperature:g}"
     method += f" of {modes} modes" if modes else ""
-    method += f" by {reading}" if reading else ""
+    method += f" by {readout}" if readout else ""
     question = _describe_question(data, config, group, method)
     if not overwrite and is_kept(out, lambda table: load_queries(table).attrs == question):
         return out
     matcher = Matcher.load(weights)
     if temperature is not None:
         matcher.temperature = temperature
-    if reading is not None:
-        matcher.reading = reading
+    if readout is not None:
+        matcher.readout = readout
     answer = model_answer(matcher, data, config)
     return _answer_all(answer, data, config, group, out, question, progress, modes)
 
 
 def evaluate_baseline(
     method: str, dataset: Path, config: EvaluateConfig, out: Path, *,
-    group: str = "", reading: Reading = AS_IT_IS, overwrite: bool = False, progress: bool = True,
+    group: str = "", readout: ModeReadout = AS_IT_IS, overwrite: bool = False, progress: bool = True,
 ) -> Path:  # fmt: skip
     """Ask hand-made descriptors, or chance (``centre``, ``random``), the same queries; ValueError for others.
 
-    ``reading`` of the descriptors' modes.
+    ``readout`` of the descriptors' modes.
     """
     if method not in BASELINES + OPTIONAL + CHANCE:
         raise ValueError(f"method must be one of {BASELINES + CHANCE}, got {method!r}")
     overwrite, progress = read_flag("overwrite", overwrite), read_flag("progress", progress)
     out = Path(out)
     data = load_dataset(dataset, "test")
-    asked = method if reading == AS_IT_IS else f"{method} by {reading}"
+    asked = method if readout == AS_IT_IS else f"{method} by {readout}"
     question = _describe_question(data, config, group, asked)
     if not overwrite and is_kept(out, lambda table: load_queries(table).attrs == question):
         return out
-    answer = _chance_answer(method, data) if method in CHANCE else _classical_answer(method, data, reading)
+    answer = _chance_answer(method, data) if method in CHANCE else _classical_answer(method, data, readout)
     return _answer_all(answer, data, config, group, out, question, progress)
 
 
@@ -146,7 +147,7 @@ def _is_nested(values: Any, depth: int) -> bool:
     return isinstance(values, dict) and (depth == 0 or all(_is_nested(value, depth - 1) for value in values.values()))
 
 
-def _classical_answer(method: str, data: Dataset, reading: Reading) -> Answer:
+def _classical_answer(method: str, data: Dataset, readout: ModeReadout) -> AnswerFunction:
     images = [data.load_image(i) for i in range(len(data))]
     masks = [data.load_mask(i) for i in range(len(data))]
     matcher, last = BaselineMatcher(method), np.array(data.size, dtype=np.float32) - 0.5
@@ -155,12 +156,12 @@ def _classical_answer(method: str, data: Dataset, reading: Reading) -> Answer:
         """Modes and entropies (nats) of pixels ``xy`` of the first image."""
         xy = np.clip(xy, -0.5, last)  # a corner may stick out of the image: the networks take its nearest pixel as well
         heatmap, centres = matcher.compute_heatmaps(images[first], images[second], xy, masks[second])
-        return read_heatmap(heatmap, torch.from_numpy(n), centres, reading=reading)
+        return read_heatmap(heatmap, torch.from_numpy(n), centres, readout=readout)
 
     return answer
 
 
-def _chance_answer(method: str, data: Dataset) -> Answer:
+def _chance_answer(method: str, data: Dataset) -> AnswerFunction:
     """All modes at the centre of the object's pixels, or each at a random one of them."""
     pixels = [np.argwhere(data.load_mask(i))[:, ::-1].astype(float) for i in range(len(data))]
     rng = np.random.default_rng(0)
@@ -185,13 +186,13 @@ def _describe_question(data: Dataset, config: EvaluateConfig, group: str, method
 
 
 def _answer_all(
-    answer: Answer, data: Dataset, config: EvaluateConfig, group: str, out: Path, question: dict[str, str],
+    answer: AnswerFunction, data: Dataset, config: EvaluateConfig, group: str, out: Path, question: dict[str, str],
     progress: bool, modes: int = 0,
 ) -> Path:  # fmt: skip
     """Ask every query and write the table of answers, each page of it with a checksum."""
     with saying_what_stays(lambda: f"stopped: nothing of {out} is kept, tables that are finished are"):
         table = ask(answer, data, config, group, progress, out.stem, modes)
     table.attrs = question
-    with writing(out) as aside:
+    with atomic_write(out) as aside:
         table.to_parquet(aside, index=False, write_page_checksum=True)
     return out

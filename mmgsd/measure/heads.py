@@ -56,12 +56,12 @@ def measure_heads(
     """The measures of `evaluate_heads`."""
     if not matcher.config.heads:
         return dict.fromkeys(MEASURES)
-    said = describe(matcher, data, np.arange(len(data)))
+    outputs = describe(matcher, data, np.arange(len(data)))
     values = (
-        measure_mask_iou(said, data),
-        compute_auroc(*_ask_pixels(said, data, np.random.default_rng(config.seed))),
-        compute_auroc(*_ask_modes(matcher, said, data, config, progress)),
-        *_measure_absent(np.array([-float(said[index].present) for index in range(len(data))]), data),
+        measure_mask_iou(outputs, data),
+        compute_auroc(*_ask_pixels(outputs, data, np.random.default_rng(config.seed))),
+        compute_auroc(*_ask_modes(matcher, outputs, data, config, progress)),
+        *_measure_absent(np.array([-float(outputs[index].presence) for index in range(len(data))]), data),
     )
     return {n: round(float(v), 4) if np.isfinite(v) else None for n, v in zip(MEASURES, values, strict=True)}
 
@@ -74,28 +74,28 @@ def _measure_absent(score: np.ndarray, data: Dataset) -> list[float]:
     return [compute_auroc(score[kind | data.present], ~data.present[kind | data.present]) for kind in kinds]
 
 
-def measure_mask_iou(said: dict[int, Outputs], data: Dataset) -> float:
+def measure_mask_iou(outputs: dict[int, Outputs], data: Dataset) -> float:
     """Mean intersection over union of the masks, over the images that show the object; NaN of none."""
     shares = []
     for index in np.flatnonzero(data.present):
-        found = cv2.resize(said[index].mask.cpu().numpy(), data.size, interpolation=cv2.INTER_LINEAR) > 0
+        found = cv2.resize(outputs[index].mask.cpu().numpy(), data.size, interpolation=cv2.INTER_LINEAR) > 0
         true = data.load_mask(index)
         shares.append((found & true).sum() / max(1, (found | true).sum()))
     return float(np.mean(shares)) if shares else np.nan
 
 
-def _ask_pixels(said: dict[int, Outputs], data: Dataset, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def _ask_pixels(outputs: dict[int, Outputs], data: Dataset, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """How likely random pixels of each image show the object, and whether they do: (N PIXELS,) each."""
     scores, true = [], []
     for index in range(len(data)):
         xy = rng.integers(0, data.size, (PIXELS, 2))
-        scores.append(look_up(None, said[index].mask, xy, data.size))
+        scores.append(look_up(None, outputs[index].mask, xy, data.size))
         true.append(data.load_mask(index)[xy[:, 1], xy[:, 0]])
     return np.concatenate(scores), np.concatenate(true)
 
 
 def _ask_modes(
-    matcher: Matcher, said: dict[int, Outputs], data: Dataset, config: EvaluateConfig, progress: bool
+    matcher: Matcher, outputs: dict[int, Outputs], data: Dataset, config: EvaluateConfig, progress: bool
 ) -> tuple[np.ndarray, np.ndarray]:
     """How likely each mode of visible sources is seen, and whether the true match paired with it is: (M,) each."""
     points, group = choose_points(config.points, data.n_points), data.group(matcher.config.group)
@@ -104,8 +104,8 @@ def _ask_modes(
     for first, second in ProgressBar(draw_pairs(data, config), desc="heads", disable=not progress, leave=False):
         seen = data.visible[first, points]
         xy, orbit = torch.from_numpy(data.xy[first, points[seen]]), orbits[seen]
-        modes = _find_modes(matcher, said[first], said[second], xy, data.size, n=orbits.shape[1])
-        visible = matcher.compute_visible(said[first], said[second], xy, modes, (data.size, data.size))
+        modes = _find_modes(matcher, outputs[first], outputs[second], xy, data.size, n=orbits.shape[1])
+        visible = matcher.compute_visible(outputs[first], outputs[second], xy, modes, (data.size, data.size))
         paired = assign_modes(modes.double().cpu().numpy(), data.xy[second][orbit].astype(float))  # of each true match
         scores.append(np.take_along_axis(visible.cpu().numpy(), paired, 1).ravel())
         true.append(data.visible[second][orbit].ravel())
@@ -118,4 +118,4 @@ def _find_modes(
     """Modes (S, n, 2) px of source pixels (S, 2)."""
     heatmap = matcher.compute_heatmaps(said0, said1, xy, size)
     centres = compute_cell_centres(size, heatmap.shape[-2:])
-    return read_heatmap(heatmap, n, centres, reading=matcher.reading)[0].modes
+    return read_heatmap(heatmap, n, centres, readout=matcher.readout)[0].modes

@@ -246,10 +246,10 @@ def score_answer(answer: Match, target: Photograph) -> pd.DataFrame:
     rows, k = [], len(target.xy)
     for modes, best in zip(answer.seen_first().modes, answer.best().xy, strict=True):
         present = modes[~np.isnan(modes).any(1)]
-        apart = np.linalg.norm(present[:, None] - target.xy[None], axis=-1) / size_px  # (n, k)
-        near, nearest = apart.min(0), np.linalg.norm(target.xy - best, axis=1).min() / size_px
+        distance = np.linalg.norm(present[:, None] - target.xy[None], axis=-1) / size_px  # (n, k)
+        near, nearest = distance.min(0), np.linalg.norm(target.xy - best, axis=1).min() / size_px
         found = [float((near < share).mean()) for share in (0.05, 0.1)]
-        spurious = float((apart[:k].min(1) > 0.1).mean())
+        spurious = float((distance[:k].min(1) > 0.1).mean())
         rows.append([target.source, str(target.path), *found, spurious, 100 * float(nearest)])
     return pd.DataFrame(rows, columns=["from", "file", *MEASURES])
 

@@ -18,7 +18,7 @@ from mmgsd.model.heads import Outputs
 from mmgsd.model.network import compute_cell_centres
 from mmgsd.progress import ProgressBar
 
-Answer = Callable[[int, int, np.ndarray, np.ndarray], tuple[Mixture, Tensor]]
+AnswerFunction = Callable[[int, int, np.ndarray, np.ndarray], tuple[Mixture, Tensor]]
 
 
 def choose_points(count: int, total: int) -> np.ndarray:
@@ -32,7 +32,7 @@ def draw_pairs(data: Dataset, config: EvaluateConfig) -> np.ndarray:
 
 
 def ask(
-    answer: Answer, data: Dataset, config: EvaluateConfig, group: str, progress: bool, name: str, modes: int = 0
+    answer: AnswerFunction, data: Dataset, config: EvaluateConfig, group: str, progress: bool, name: str, modes: int = 0
 ) -> pd.DataFrame:
     """Ask ``answer`` every query and compare with the truth; one row a query."""
     pairs = draw_pairs(data, config)
@@ -46,7 +46,7 @@ def ask(
         frame = pd.DataFrame({"pair": pair, "image0": first, "image1": second, "point": points})
         frame = frame.assign(visible=data.visible[first, points], n=count, entropy=entropy.cpu().numpy())
         hidden = [int((~data.visible[second, o]).sum()) for o in orbits]
-        frame = frame.assign(hidden=hidden, outside=fit.outside.cpu().numpy())
+        frame = frame.assign(hidden=hidden, outside=fit.outlier_mass.cpu().numpy())
         means, covariances, weights = (t.double().cpu().numpy() for t in (fit.modes, fit.covariances, fit.weights))
         frame[list(LISTS)] = None
         for n in np.unique(count):
@@ -61,7 +61,7 @@ def ask(
     return pd.concat(frames, ignore_index=True)
 
 
-def model_answer(matcher: Matcher, data: Dataset, config: EvaluateConfig) -> Answer:
+def model_answer(matcher: Matcher, data: Dataset, config: EvaluateConfig) -> AnswerFunction:
     """A trained model's answers about the pairs of ``config``, whose images are described at once."""
     descriptors = describe(matcher, data, np.unique(draw_pairs(data, config)))
 
@@ -69,7 +69,7 @@ def model_answer(matcher: Matcher, data: Dataset, config: EvaluateConfig) -> Ans
         """Modes and entropies (nats) of pixels ``xy`` of the first image."""
         heatmap = matcher.compute_heatmaps(descriptors[first], descriptors[second], torch.from_numpy(xy), data.size)
         centres = compute_cell_centres(data.size, heatmap.shape[-2:])
-        return read_heatmap(heatmap, torch.from_numpy(n), centres, reading=matcher.reading)
+        return read_heatmap(heatmap, torch.from_numpy(n), centres, readout=matcher.readout)
 
     return answer
 
@@ -96,7 +96,7 @@ def measure_rmse(matcher: Matcher, data: Dataset, *, pairs: int = 60, points: in
     return measure_mean_error(model_answer(matcher, data, config), matcher, data, config)
 
 
-def measure_mean_error(answer: Answer, matcher: Matcher, data: Dataset, config: EvaluateConfig) -> float:
+def measure_mean_error(answer: AnswerFunction, matcher: Matcher, data: Dataset, config: EvaluateConfig) -> float:
     """Mean RMSE (px) of the answers to queries with a visible source."""
     queries = ask(answer, data, config, matcher.config.group, False, "")
     return float(queries.rmse_px[queries.visible].mean())

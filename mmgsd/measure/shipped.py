@@ -20,7 +20,7 @@ from mmgsd.files import read_json
 from mmgsd.match.baselines import BaselineMatcher, FeatureMatcher
 from mmgsd.match.match import RADIUS_PX, Match
 from mmgsd.match.matcher import Matcher, find_weights
-from mmgsd.match.mixture import AS_IT_IS, Reading
+from mmgsd.match.mixture import AS_IT_IS, ModeReadout
 from mmgsd.measure.cloth_renders import measure_cloth_renders
 from mmgsd.measure.evaluation import evaluate_baseline, evaluate_model, load_queries
 from mmgsd.measure.heads import MEASURES as HEADS
@@ -61,8 +61,8 @@ def measure_weights(
     file = weights or find_weights(name)
     matcher = Matcher.load(file)
     row = {"object": matcher.object, "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
-           "calibrated": matcher.calibration is not None, "power": matcher.reading.power,
-           "sharpness": matcher.reading.sharpness}  # fmt: skip
+           "calibrated": matcher.calibration is not None, "power": matcher.readout.exponent,
+           "sharpness": matcher.readout.mean_exponent}  # fmt: skip
     for kind, preset in zip(SETS, presets, strict=bool(presets)):
         paths = Paths(root, preset)
         data, config = paths.dataset(matcher.object), load_preset(preset).evaluate
@@ -89,13 +89,13 @@ def measure_read(
     weights, _, numbers = name.partition("@")
     file = find_weights(weights)
     matcher = Matcher.load(file)
-    reading = matcher.reading = parse_reading(numbers, matcher.reading)
+    readout = matcher.readout = parse_readout(numbers, matcher.readout)
     row: dict[str, Any] = {"object": matcher.object, "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
-                           "power": reading.power, "sharpness": reading.sharpness}  # fmt: skip
+                           "power": readout.exponent, "sharpness": readout.mean_exponent}  # fmt: skip
     for preset in presets:
         paths = Paths(root, preset)
         data, out = paths.dataset(matcher.object), paths.queries(f"shipped-{name}")
-        queries = load_queries(evaluate_model(file, data, load_preset(preset).evaluate, out, reading=reading,
+        queries = load_queries(evaluate_model(file, data, load_preset(preset).evaluate, out, readout=readout,
                                               progress=progress))  # fmt: skip
         row[preset] = aggregate(queries[queries.visible])
     if photographs:
@@ -111,13 +111,13 @@ def name_read(name: str, row: Mapping[str, Any]) -> str:
     return name if power == sharpness == 1 else f"{name}@{power:g},{sharpness:g}"
 
 
-def parse_reading(text: str, like: Reading) -> Reading:
+def parse_readout(text: str, like: ModeReadout) -> ModeReadout:
     """The reading that "power,sharpness" says, as round as ``like``; ValueError for anything else."""
     try:
         power, sharpness = map(float, text.split(","))
     except ValueError:
         raise ValueError(f"a reading must be POWER,SHARPNESS, two numbers from 1 on, got {text!r}") from None
-    return dataclasses.replace(like, power=power, sharpness=sharpness)
+    return dataclasses.replace(like, exponent=power, mean_exponent=sharpness)
 
 
 def _summarise(table: Path, matcher: Matcher) -> dict[str, Any]:
@@ -181,16 +181,16 @@ def measure_baseline(
     Its modes are read as the shipped weights of the object are.
     """
     segmenter = Matcher.load(find_weights(object))
-    power, sharpness = segmenter.reading.power, segmenter.reading.sharpness
-    reading = dataclasses.replace(AS_IT_IS, power=power, sharpness=sharpness)
+    power, sharpness = segmenter.readout.exponent, segmenter.readout.mean_exponent
+    readout = dataclasses.replace(AS_IT_IS, exponent=power, mean_exponent=sharpness)
     row: dict[str, Any] = {"object": object, "power": power, "sharpness": sharpness}
     for preset in presets:
         paths = Paths(root, preset)
         out = paths.queries(name_read(f"{object}-{method}", row))
         queries = load_queries(evaluate_baseline(method, paths.dataset(object), load_preset(preset).evaluate, out,
-                                                 reading=reading, progress=progress))  # fmt: skip
+                                                 readout=readout, progress=progress))  # fmt: skip
         row[preset] = aggregate(queries[queries.visible])
     if photographs:
-        masked = Masked(BaselineMatcher(method, reading=reading), segmenter, modes=segmenter.modes)
+        masked = Masked(BaselineMatcher(method, readout=readout), segmenter, modes=segmenter.num_modes)
         row["photographs"] = measure_answers(masked, read_photographs(photographs, object), progress=progress)
     return row

@@ -116,8 +116,8 @@ def _explode(queries: pd.DataFrame) -> pd.DataFrame:
 
 def measure_modes(modes: pd.DataFrame) -> Modes:
     """What a calibration asks of the M modes of `get_modes`, (M,) each."""
-    extent = np.exp(modes.entropy.to_numpy(float) / 2)
-    return Modes(modes.spread_px.to_numpy(), modes.share.to_numpy(), extent)
+    effective_size_px = np.exp(modes.entropy.to_numpy(float) / 2)
+    return Modes(modes.spread_px.to_numpy(), modes.share.to_numpy(), effective_size_px)
 
 
 def compute_confidences(

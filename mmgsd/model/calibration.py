@@ -22,7 +22,7 @@ class Modes(NamedTuple):
 
     spread: np.ndarray  # (…) px, std
     share: np.ndarray  # (…) weight by that of an equal one of the query's modes, in [0, 1]
-    extent: np.ndarray  # (…) px, exp(entropy / 2): side of the square that the whole heatmap spreads over
+    effective_size_px: np.ndarray  # (…) px, exp(entropy / 2): side of the square that the whole heatmap spreads over
 
 
 class Gaussian:
@@ -56,7 +56,7 @@ class Calibration(Gaussian):
 
     ellipse: tuple[float, ...]  # (20,) ascending
     radius: tuple[float, ...]  # (20,) ascending
-    powers: tuple[float, ...]  # (3,) of spread, share and extent in `compute_unit`
+    powers: tuple[float, ...]  # (3,) of spread, share and effective size in `compute_unit`
     pairs: int  # that the tables were read from
     ece_ellipse: float = math.nan  # expected calibration error on pairs that the tables were not read from
     ece_confidence: float = math.nan
@@ -115,8 +115,9 @@ def parse_calibration(text: str) -> Calibration:
 
 
 def compute_unit(modes: Modes, powers: tuple[float, ...]) -> np.ndarray:
-    """What distances from modes are measured by (…): spread, share and extent, each to its power."""
-    return modes.spread ** powers[0] * np.maximum(modes.share, LEAST) ** powers[1] * modes.extent ** powers[2]
+    """What distances from modes are measured by (…): spread, share and effective size, each to its power."""
+    a, b, c = powers
+    return modes.spread**a * np.maximum(modes.share, LEAST) ** b * modes.effective_size_px**c
 
 
 def compute_share(weights: np.ndarray) -> np.ndarray:

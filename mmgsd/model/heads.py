@@ -1,5 +1,5 @@
-"""What a network says beside its descriptors, and the losses that teach it: where the object is, whether it is there at
-all, and whether a match is seen at a place or hidden.
+"""What a network returns beside its descriptors, and the losses that teach it: where the object is, whether it is there
+at all, and whether a match is seen at a place or hidden.
 
 All of it is read from the descriptors' own features and learnt from labels that every data set has: masks, visibility
 of the material points, and images without the object.
@@ -16,24 +16,24 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-SURFACE = 16  # numbers that describe a place's surface to the judge: is it a fold, an edge, something in front?
-HIDDEN = 64  # units of the judge
-JITTER_PX = 6.0  # std by which true matches are moved before they are judged: modes are never exact
+SURFACE = 16  # numbers that describe a place's surface to the visibility head: a fold, an edge, something in front?
+HIDDEN = 64  # units of the visibility head
+JITTER_PX = 6.0  # std by which true matches are moved before their visibility is learnt: modes are never exact
 ELSEWHERE = 2  # further places a query that are no match, and so not seen there
 BESIDE = 1 / 64  # of an image's longer side: so near to the object a pixel is taken for one on it
 LOOKED_UP = 128  # cells of the longer side that a mask is reduced to before
 ELSEWHERE_WEIGHT = 0.02  # of a heatmap's mass off the object, where the network itself says what is off it
-SHARES = {"mask": 1.0, "judge": 0.5, "present": 0.2}  # of the losses
+SHARES = {"mask": 1.0, "visibility": 0.5, "presence": 0.2}  # of the losses
 
 
 @dataclass(frozen=True)
 class Outputs:
-    """What a network says of B images, or without the first axis of one; only ``descriptors`` where it has no heads."""
+    """What a network returns for B images, or without the first axis for one; only ``descriptors`` without heads."""
 
     descriptors: Tensor  # (B, C, h, w)
     mask: Tensor | None = None  # (B, hm, wm) logits: is the object seen here?
-    surface: Tensor | None = None  # (B, SURFACE, h, w) for `Heads.judge`
-    present: Tensor | None = None  # (B,) logits: is the object in the image?
+    surface: Tensor | None = None  # (B, SURFACE, h, w) for `Heads.visibility`
+    presence: Tensor | None = None  # (B,) logits: is the object in the image?
 
     def turn(self, quarters: int) -> Outputs:
         """The same of images turned by so many quarters."""
@@ -48,7 +48,7 @@ class Outputs:
 
     @staticmethod
     def mean(several: Sequence[Outputs]) -> Outputs:
-        """The mean of what was said of the same images."""
+        """The mean over several outputs for the same images."""
         names = [field.name for field in fields(Outputs) if getattr(several[0], field.name) is not None]
         return Outputs(**{name: sum(getattr(one, name) for one in several) / len(several) for name in names})
 
@@ -78,26 +78,26 @@ class Heads(nn.Module):
         pooled = torch.cat([coarse.mean((2, 3)), coarse.amax((2, 3))], 1)
         return self.mask(x)[:, 0].float(), self.surface(features).float(), self.present(pooled)[:, 0].float()
 
-    def judge(self, source: Tensor, there: Tensor, surface: Tensor) -> Tensor:
+    def visibility(self, source: Tensor, there: Tensor, surface: Tensor) -> Tensor:
         """Logits (...) that the surface of the pixel asked about is seen at a place.
 
         ``source`` (..., D) is its descriptor, ``there`` (..., roles D) what the place has, ``surface``
         (..., SURFACE). A place shows what its own descriptor as a source says: it need not be what hides below it.
         """
-        apart = [source - role for role in there.chunk(self.roles, -1)]
-        near = [difference.square().sum(-1, keepdim=True).clamp(max=50) / 10 for difference in apart]
-        return self.judge_layers(torch.cat([*apart, *near, surface], -1))[..., 0]
+        differences = [source - role for role in there.chunk(self.roles, -1)]
+        near = [difference.square().sum(-1, keepdim=True).clamp(max=50) / 10 for difference in differences]
+        return self.judge_layers(torch.cat([*differences, *near, surface], -1))[..., 0]
 
 
-def weigh_cells(said: Outputs, shape: tuple[int, int], mask: Tensor | None = None) -> Tensor | None:
+def weigh_cells(outputs: Outputs, shape: tuple[int, int], mask: Tensor | None = None) -> Tensor | None:
     """How much a match may lie in each cell (h, w) of a heatmap, in [0, 1]; None where nothing is known of the object.
 
     1 at the object and beside it, for masks are not exact and a hidden point may lie a little aside. Elsewhere nothing
     under a ``mask`` (H, W) bool of the caller's, and `ELSEWHERE_WEIGHT` under the network's own, which may be wrong.
     """
-    if mask is None and said.mask is None:
+    if mask is None and outputs.mask is None:
         return None
-    known = said.mask.sigmoid() if mask is None else mask.to(said.descriptors.device).float()
+    known = outputs.mask.sigmoid() if mask is None else mask.to(outputs.descriptors.device).float()
     cells = F.adaptive_max_pool2d(known[None, None], tuple(shape))
     cells = F.max_pool2d(cells, 3, 1, 1)[0, 0]
     return cells if mask is not None else cells.clamp(min=ELSEWHERE_WEIGHT)
@@ -126,14 +126,14 @@ def compute_mask_loss(logits: Tensor, mask: Tensor) -> Tensor:
     return F.binary_cross_entropy_with_logits(logits, target)
 
 
-def compute_present_loss(logits: Tensor, present: Tensor) -> Tensor:
+def compute_presence_loss(logits: Tensor, present: Tensor) -> Tensor:
     """Cross-entropy of presence logits (B,) with (B,) bool; the few images without the object count ten times."""
     weight = torch.where(present, 1.0, 10.0).to(logits.dtype)
     return F.binary_cross_entropy_with_logits(logits, present.float(), weight)
 
 
-def compute_judge_loss(logits: Tensor, seen: Tensor, counted: Tensor) -> Tensor:
-    """Cross-entropy of the judge's logits (...) with ``seen`` (...) bool, over those ``counted`` (...) bool.
+def compute_visibility_loss(logits: Tensor, seen: Tensor, counted: Tensor) -> Tensor:
+    """Cross-entropy of visibility logits (...) with ``seen`` (...) bool, over those ``counted`` (...) bool.
 
     Seen and unseen places weigh as much as each other.
     """

@@ -105,8 +105,8 @@ class PyramidNetwork(nn.Module):
                 finer = self._find_detail(x)
                 features[0] = features[0] + _resize(finer[-1], features[0])
             levels = self._decode(features)
-            said = self.heads(levels[-1], levels[0], finer[-2::-1]) if with_heads else ()
-        return Outputs(self.head(levels[-1].float()), *said)
+            heads = self.heads(levels[-1], levels[0], finer[-2::-1]) if with_heads else ()
+        return Outputs(self.head(levels[-1].float()), *heads)
 
     def _compute_taps(self, x: Tensor) -> list[Tensor]:
         """The trunk's features of each level, the finest first."""

@@ -20,7 +20,6 @@ from mmgsd.model.tensors import read_tensors
 FORMAT = "mmgsd-1"
 PLACES = "places"  # beside the network's tensors: what its object's material points are described as
 PICKLES = (b"PK\x03\x04", b"\x80")  # how PyTorch's own files begin
-NUMBERS = ("bandwidth", "temperature", "power", "sharpness")  # settings that not every file has
 LARGEST = {"input_px": 8192, "descriptor_dim": 4096}  # of a configuration; more would not fit a memory
 ACCEPTED = {  # what a value of the metadata must be
     "config": "a JSON object, the training's configuration",
@@ -60,7 +59,7 @@ def read_weights(path: Path | str) -> Weights:
                          f"not {FORMAT!r}")  # fmt: skip
     config, known = _read_config(path, metadata)
     settings = {"modes": _read(path, metadata, "modes", int), "size": _read(path, metadata, "size", _parse_size)}
-    settings |= {name: _read(path, metadata, name, float) for name in NUMBERS if name in metadata}
+    settings |= {name: _read(path, metadata, name, parse) for name, parse in NUMBERS.items() if name in metadata}
     if "calibration" in metadata:
         settings["calibration"] = _read(path, metadata, "calibration", parse_calibration)
     if PLACES in state:
@@ -100,6 +99,16 @@ def _read(path: Path, metadata: dict[str, str], key: str, parse: Any) -> Any:
     except (ValueError, TypeError, RecursionError) as error:
         raise ValueError(f"{path}: {key!r} of its metadata must be {ACCEPTED[key]}, got {metadata[key]!r:.80}: "
                          "get the file anew") from error  # fmt: skip
+
+
+def _at_least_one(text: str) -> float:
+    if not float(text) >= 1:
+        raise ValueError("too small")
+    return float(text)
+
+
+# settings that not every file has
+NUMBERS = {"bandwidth": float, "temperature": float, "power": _at_least_one, "sharpness": _at_least_one}
 
 
 def _parse_size(text: str) -> tuple[int, ...]:

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from mmgsd.files import DamagedFileError, locked, set_aside, write_json
+from mmgsd.files import DamagedFileError, locked, quarantine, write_json
 from mmgsd.paths import Paths
 from mmgsd.studies.registry import REMEDY, read_table
 
@@ -79,7 +79,7 @@ def load_state(paths: Paths) -> dict[str, Any]:
     try:
         return read_table(path) if path.is_file() else {}
     except DamagedFileError:
-        set_aside(path)
+        quarantine(path)
         return {}
 
 

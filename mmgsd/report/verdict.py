@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from mmgsd.files import DamagedFileError, set_aside, write_json, write_text
+from mmgsd.files import DamagedFileError, quarantine, write_json, write_text
 from mmgsd.paths import Paths
 from mmgsd.report.stages import find_run
 from mmgsd.studies.claims import get
@@ -76,7 +76,7 @@ def load_stored(paths: Paths) -> dict[str, Any]:
             raise DamagedFileError(f"{path} lacks some of {', '.join(nothing)}")
         return state
     except DamagedFileError:
-        set_aside(path)
+        quarantine(path)
         return nothing
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from mmgsd.config import RenderConfig, from_dict
-from mmgsd.files import writing
+from mmgsd.files import atomic_write
 from mmgsd.images import encode_image, encode_mask
 from mmgsd.scene.child import one_core, run_main
 from mmgsd.scene.objects.planar_object import PlanarObject
@@ -30,7 +30,7 @@ def render_job(job: dict[str, Any]) -> Path:
 
     planar = PlanarObject.from_dict(job["sheet"]) if job.get("sheet") else None
     config, out = from_dict(RenderConfig, job["config"]), Path(job["out"])
-    with writing(out) as aside, zipfile.ZipFile(aside, "w", zipfile.ZIP_STORED) as archive:
+    with atomic_write(out) as aside, zipfile.ZipFile(aside, "w", zipfile.ZIP_STORED) as archive:
         archive.comment, labels = job.get("mark", "").encode(), []
         for episode, n_views in job["episodes"]:
             for i, view in enumerate(render_episode(config, job["split"], episode, n_views, planar)):

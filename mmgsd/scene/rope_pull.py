@@ -82,7 +82,7 @@ class _Chain:
         points = self.points
         for step in range(rounds):
             if step % ROUNDS == 0:
-                pairs, apart = near_pairs(points, 0.0)
+                pairs, distance = near_pairs(points, 0.0)
             points[self.held] = targets
             self._follow(targets)
             weights = np.where(points[:, 2] < LOW, LYING, 1.0)
@@ -93,7 +93,7 @@ class _Chain:
                 bend(points, 0.0, stride)
             for stride in BEND_STRIDES:
                 limit_bends(points, stride)
-            push_apart(points, pairs, apart)
+            push_apart(points, pairs, distance)
             points[:, 2] = np.maximum(points[:, 2] - FALL, 0.5)
         points[self.held] = targets
 

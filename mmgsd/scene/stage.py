@@ -36,12 +36,12 @@ from mmgsd.files import (
     DamagedFileError,
     check_ours,
     locked,
+    quarantine,
     read_json,
     remove_folder,
     replace_folder,
     saying_what_stays,
     scratch_folder,
-    set_aside,
     write_bytes,
     write_json,
 )
@@ -280,7 +280,7 @@ def _is_claimed(config: RenderConfig, partial: Path) -> bool:
         if not isinstance(stored, dict):
             raise DamagedFileError(f"{path} holds no configuration")
     except DamagedFileError:
-        set_aside(path)
+        quarantine(path)
         return False
     _check_same_config(config, stored, partial)
     return True
@@ -302,7 +302,7 @@ def _is_whole(path: Path, job: dict, claimed: bool) -> bool:
         whole = False
     whole = whole and (job_hash == job["mark"] or (claimed and not job_hash))
     if not whole:
-        set_aside(path)
+        quarantine(path)
     return whole
 
 

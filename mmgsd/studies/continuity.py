@@ -42,8 +42,9 @@ def measure_jumps(matcher: Matcher, data: Dataset, *, config: EvaluateConfig = P
         offsets = np.full((data.n_points, group.order, 2), np.nan)
         assigned = assign_modes(modes.modes, true)[..., None]
         offsets[points] = np.take_along_axis(modes.modes, assigned, 1) - true
-        apart = np.concatenate([np.linalg.norm(a - b, axis=-1).ravel() for a, b in _list_neighbours(offsets, data)])
-        jumps.append(apart[np.isfinite(apart)] > JUMP_PX)
+        neighbours = _list_neighbours(offsets, data)
+        difference = np.concatenate([np.linalg.norm(a - b, axis=-1).ravel() for a, b in neighbours])
+        jumps.append(difference[np.isfinite(difference)] > JUMP_PX)
     found = np.concatenate(jumps)
     return {"jumps": round(float(found.mean()), 4), "neighbours": len(found)}
 

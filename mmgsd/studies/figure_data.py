@@ -23,7 +23,7 @@ from mmgsd.match.matcher import Matcher
 from mmgsd.measure.metrics import ErrorSummary, summarise_errors
 from mmgsd.measure.shipped import PLAIN
 
-QUALITY = 90  # of the example's images, JPEG
+EXAMPLE_QUALITY = 90  # of the example's images, JPEG
 TRUE = "true{}"  # the tensors of the queries' true matches: true, true1, …
 _SUMMARY = ("mean_px", "histogram")  # and asked, which all methods share
 _IMAGES = ("image0", "image1")
@@ -137,7 +137,7 @@ def save_figure_data(data: FigureData, path: Path) -> Path:
     tensors = {"asked": asked} | {TRUE.format(k or ""): true for k, true in enumerate(data.true)}
     for name in _IMAGES:
         image = cv2.cvtColor(getattr(example, name), cv2.COLOR_RGB2BGR)
-        tensors[name] = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1]
+        tensors[name] = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, EXAMPLE_QUALITY])[1]
     for method, summary in data.errors.items():
         if not np.array_equal(summary.asked, asked):
             raise ValueError(f"errors[{method!r}] must answer the same queries as the other methods")

@@ -25,12 +25,12 @@ from mmgsd.command import Option
 from mmgsd.config import DEFAULT_GROUP, OBJECTS
 from mmgsd.figures.folding import mark_moves, mark_success, plot_rollouts, save_slides
 from mmgsd.figures.style import PAGE_IN, check_filled, finish_axes, save_figure, styled
-from mmgsd.files import DamagedFileError, read_json, set_aside, write_json
-from mmgsd.fold.agreement import Motion
+from mmgsd.files import DamagedFileError, quarantine, read_json, write_json
+from mmgsd.fold.consensus import Motion
 from mmgsd.fold.demonstration import Demonstration, Look, write_demonstration
 from mmgsd.fold.jobs import act_job, demonstration_job, look_job, run_jobs, start_job, true_moves
 from mmgsd.fold.measures import SIDES_M, SUCCESS, compare_rollouts, estimate_mean, estimate_share, measure_outcome
-from mmgsd.fold.moves import Answer, choose_moves
+from mmgsd.fold.moves import PolicyAnswer, choose_moves
 from mmgsd.fold.state import State, read_state
 from mmgsd.fold.tasks import GROUNDS, STARTS, TASKS, Task, find_task
 from mmgsd.match.camera import compute_rays
@@ -46,7 +46,7 @@ ROLLOUTS = {"smoke": 2, "quick": 36, "paper": 100}  # of each policy and object
 MORE = ("wrinkled", 0.4)  # a start of which few rollouts count, and how many more begin from it, of the count
 DEMONSTRATIONS = "demonstrations"  # instead of a preset: write these alone
 REFERENCE = "mmgsd"  # the policy that the others are compared with, rollout by rollout
-QUALITY = 90  # of the images of demonstrations as files
+DEMONSTRATION_QUALITY = 90  # of the images of demonstrations as files
 AGREES = 0.7  # share of the questions that agree from which a cautious robot acts
 HEADS = ("success", "as true matches", "error", "beside MMGSD's", "error of all")
 SLACK = 0.03  # of the side, by which an error may be above that of the true matches and be as good
@@ -133,8 +133,9 @@ def write_demonstrations(root: Path, *, workers: int = 0, scheduler: str = "", p
     bench = Bench(Paths(root, "quick").generated / "folding", how)
     bench.demonstrate(TASKS.values())
     folder = root / "data" / "demonstrations"
-    return [write_demonstration(bench.make_demonstration(task), folder / f"{task.name}.json", quality=QUALITY)
-            for task in TASKS.values()]  # fmt: skip
+    files = {task: folder / f"{task.name}.json" for task in TASKS.values()}
+    return [write_demonstration(bench.make_demonstration(task), file, quality=DEMONSTRATION_QUALITY)
+            for task, file in files.items()]  # fmt: skip
 
 
 class Bench:
@@ -144,7 +145,7 @@ class Bench:
         self.folder, self.how = Path(folder), dict(how)
         self.demonstrated: dict[str, list[State]] = {}
         self.ends: dict[tuple[Policy, Rollout], Path] = {}
-        self.acted: dict[tuple[Policy, Rollout], list[tuple[Path, Answer]]] = {}  # each look, and what was done then
+        self.acted: dict[tuple[Policy, Rollout], list[tuple[Path, PolicyAnswer]]] = {}  # each look, and what was done
 
     def make_starts(self, rollouts: list[Rollout]) -> dict[Rollout, Path]:
         """First states, and before them the states that the rollouts' demonstrations go through."""
@@ -186,7 +187,7 @@ class Bench:
     ) -> dict[str, dict[str, dict[str, Any]]]:
         """{policy: {rollout: how it ended}} of every policy from every first state."""
         files = {(policy, rollout): starts[rollout] for policy in policies for rollout in rollouts}
-        answers: dict[tuple[Policy, Rollout], list[Answer]] = {arm: [] for arm in files}
+        answers: dict[tuple[Policy, Rollout], list[PolicyAnswer]] = {arm: [] for arm in files}
         for number in range(max(len(find_task(rollout.task).looks) for rollout in rollouts)):
             going = [arm for arm in files if len(find_task(arm[1].task).looks) > number]
             for arm in ProgressBar(going, desc="answer", disable=not self.how["progress"], leave=False):
@@ -204,7 +205,7 @@ class Bench:
 
     def _look_again(
         self, going: list[tuple[Policy, Rollout]], number: int, files: dict[tuple[Policy, Rollout], Path],
-        answers: dict[tuple[Policy, Rollout], list[Answer]],
+        answers: dict[tuple[Policy, Rollout], list[PolicyAnswer]],
     ) -> None:  # fmt: skip
         """Put the look and the answer in place that most questions agree in, where a policy looks again if few do."""
         first = {arm: files[arm] for arm in going}
@@ -253,8 +254,8 @@ class Bench:
         return slides
 
     def _answer(
-        self, policy: Policy, rollout: Rollout, number: int, file: Path, before: list[Answer], *, again: int = 0
-    ) -> Answer:
+        self, policy: Policy, rollout: Rollout, number: int, file: Path, before: list[PolicyAnswer], *, again: int = 0
+    ) -> PolicyAnswer:
         """The moves (px) of one look, kept as a file; asked anew where the state or the policy is another."""
         state, task = read_state(file), find_task(rollout.task)
         look = f"-look{again}" if again else ""
@@ -267,22 +268,22 @@ class Bench:
             write_json(place, {"mark": mark, "moves": kept.moves.tolist(), "motion": motion, "share": kept.share})
         return kept
 
-    def _ask(self, policy: Policy, rollout: Rollout, number: int, state: State, motion: Motion | None) -> Answer:
+    def _ask(self, policy: Policy, rollout: Rollout, number: int, state: State, motion: Motion | None) -> PolicyAnswer:
         task = find_task(rollout.task)
         shown = self.demonstrated[task.name]
         look = self.make_demonstration(task).looks[number]
         if policy.name == "truth":
-            return Answer(np.array(true_moves(task.looks[number], shown[0].points, state)), None, 1.0)
+            return PolicyAnswer(np.array(true_moves(task.looks[number], shown[0].points, state)), None, 1.0)
         if policy.name == "random":
-            return Answer(draw_moves(look, state.mask, np.random.default_rng([rollout.seed, number])), None, 1.0)
+            return PolicyAnswer(draw_moves(look, state.mask, np.random.default_rng([rollout.seed, number])), None, 1.0)
         match = ask(policy, task.object, look, state.image, state.mask)
         answer = choose_moves(look, match, policy.chosen, lambda xy: find_on_table(xy, shown[number]),
                               lambda xy: find_on_table(xy, state), motion=motion)  # fmt: skip
         moves = answer.moves.reshape(-1, 2)
         pixels = state.project(np.column_stack([moves, np.zeros(len(moves))])) if len(moves) else moves
-        return Answer(pixels.reshape(-1, 2, 2), answer.motion, answer.share)
+        return PolicyAnswer(pixels.reshape(-1, 2, 2), answer.motion, answer.share)
 
-    def _judge(self, rollout: Rollout, file: Path, answers: list[Answer]) -> dict[str, Any]:
+    def _judge(self, rollout: Rollout, file: Path, answers: list[PolicyAnswer]) -> dict[str, Any]:
         state, task = read_state(file), find_task(rollout.task)
         group = load_group(task.object, DEFAULT_GROUP[task.object]).permutations
         end, side = self.demonstrated[task.name][-1].points, SIDES_M[task.object]
@@ -331,7 +332,7 @@ def summarise_rollouts(rows: dict[str, dict[str, Any]], reachable: set[str]) -> 
     return {**said, "cautious": estimate_share(sure), "faults": faults, "rollouts": each}
 
 
-def _read_answer(path: Path, mark: dict[str, str]) -> Answer | None:
+def _read_answer(path: Path, mark: dict[str, str]) -> PolicyAnswer | None:
     """What is kept of the same question; a damaged file is set aside."""
     if not path.is_file():
         return None
@@ -340,9 +341,9 @@ def _read_answer(path: Path, mark: dict[str, str]) -> Answer | None:
         if kept["mark"] != mark:
             return None
         motion = None if kept["motion"] is None else Motion(*(complex(*pair) for pair in kept["motion"]))
-        return Answer(np.array(kept["moves"], float).reshape(-1, 2, 2), motion, float(kept["share"]))
+        return PolicyAnswer(np.array(kept["moves"], float).reshape(-1, 2, 2), motion, float(kept["share"]))
     except (DamagedFileError, KeyError, TypeError, ValueError):
-        set_aside(path)
+        quarantine(path)
         return None
 
 

@@ -99,8 +99,8 @@ def judge_grasp(before: State, pick: list[float] | None, after: State) -> Outcom
 
 def summarise_grasps(rows: Mapping[str, Outcome], others: Mapping[str, Outcome]) -> dict[str, Any]:
     """Mean ``distance``, share ``lifted``, and how much farther than ``others`` the grasps are, ``beyond``."""
-    apart = [row["distance"] - others[name]["distance"] for name, row in rows.items()]
-    return {"distance": estimate_mean([row["distance"] for row in rows.values()]), "beyond": estimate_mean(apart),
+    excess = [row["distance"] - others[name]["distance"] for name, row in rows.items()]
+    return {"distance": estimate_mean([row["distance"] for row in rows.values()]), "beyond": estimate_mean(excess),
             "lifted": estimate_share([bool(row["lifted"]) for row in rows.values()])}  # fmt: skip
 
 

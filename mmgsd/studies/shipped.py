@@ -8,10 +8,10 @@
 A row a name: of weights in data/weights; of a baseline, which is asked about each object with the true masks, and in
 photographs with those that the shipped weights see, and whose modes are read as theirs; or of each model of a study of
 `STUDIES` of the preset `paper`, or of another with so many steps each (--preset quick --steps 300), which is asked
-about that preset's images. How modes are read (`mmgsd.match.mixture.Reading`) is the weights' own, unless the name says
-another after an @. The test images of the presets `paper` and `workspace`, or of that one, have to be rendered, unless
---photographs-alone leaves them out: what a row has of the same weights stays. Tables of answers are kept, so that a
-killed call goes on.
+about that preset's images. How modes are read (`mmgsd.match.mixture.ModeReadout`) is the weights' own, unless the name
+says another after an @. The test images of the presets `paper` and `workspace`, or of that one, have to be rendered,
+unless --photographs-alone leaves them out: what a row has of the same weights stays. Tables of answers are kept, so
+that a killed call goes on.
 """
 
 from __future__ import annotations
@@ -59,10 +59,10 @@ def list_names(rows: Rows, object: str) -> list[str]:
 def find_alike(rows: Rows, name: str) -> str:
     """The row of a name whose modes are read as the object's shipped weights are: its own, or one read so."""
     like = rows.get(name.partition("-")[0], {})
-    reading = [like.get(key) for key in READING]
-    if None in reading or [rows.get(name, {}).get(key) for key in READING] == reading:
+    readout = [like.get(key) for key in READING]
+    if None in readout or [rows.get(name, {}).get(key) for key in READING] == readout:
         return name
-    return f"{name}@{','.join(f'{value:g}' for value in reading)}"
+    return f"{name}@{','.join(f'{value:g}' for value in readout)}"
 
 
 def label_row(name: str) -> str:

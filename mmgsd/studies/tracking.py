@@ -24,7 +24,7 @@ from mmgsd.checks import check_choice
 from mmgsd.command import Option
 from mmgsd.config import DEFAULT_GROUP, IMAGE_SIZE, OBJECTS
 from mmgsd.figures.style import PAGE_IN, check_filled, finish_axes, save_figure, styled
-from mmgsd.files import DamagedFileError, read_json, set_aside, write_json
+from mmgsd.files import DamagedFileError, quarantine, read_json, write_json
 from mmgsd.fold.jobs import film_job, run_jobs, true_moves
 from mmgsd.fold.state import State, read_state
 from mmgsd.fold.tasks import GROUNDS, MOTIONS, TASKS, find_task
@@ -192,7 +192,7 @@ def measure_film(name: str, file: Path, out: Path) -> dict[str, float]:
             if kept["mark"] == mark:
                 return kept["measured"]
         except (DamagedFileError, KeyError, TypeError):
-            set_aside(out)
+            quarantine(out)
     points, truth = find_truth(film)
     xy, seen = method.follow(film.about["object"], film.image, film.xy[0, points])
     measured = measure_track(np.asarray(xy, float), seen, truth)

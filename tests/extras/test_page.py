@@ -24,7 +24,7 @@ from mmgsd.extras import page as page_module
 from mmgsd.extras.page import LICENCES, PACKAGE, RUNTIME, describe_mixture, make_page
 from mmgsd.files import ForeignFileError
 from mmgsd.match.matcher import Matcher
-from mmgsd.match.mixture import Reading, fit_modes
+from mmgsd.match.mixture import ModeReadout, fit_modes
 from mmgsd.paths import find_samples
 
 in_browser = pytest.mark.skipif(CHROMIUM is None, reason="needs the program chromium")
@@ -122,16 +122,16 @@ def test_another_runtime_and_none_are_refused(
 
 
 @in_browser
-@pytest.mark.parametrize("reading", [Reading(), Reading(0.05, 1.0, 6.0), Reading(0.3, 2.0, 4.0)], ids=str)
+@pytest.mark.parametrize("reading", [ModeReadout(), ModeReadout(0.05, 1.0, 6.0), ModeReadout(0.3, 2.0, 4.0)], ids=str)
 def test_the_mixture_is_the_librarys_on_200_questions(
-    hollow: Path, matcher: Matcher, chromium: Any, rng: np.random.Generator, reading: Reading
+    hollow: Path, matcher: Matcher, chromium: Any, rng: np.random.Generator, readout: ModeReadout
 ) -> None:
     pair = matcher.prepare(*map(mmgsd.read_image, find_samples("cloth")))
     heats = torch.from_numpy(pair.match(rng.uniform(60, 420, (200, 2))).cells)
     rows, columns = heats.shape[1:]
     xs, ys = (torch.arange(count, dtype=torch.float32) for count in (columns, rows))
-    expected = fit_modes(heats, 4, xs, ys, reading=reading, merge=True)
-    asked = [heats.flatten(1).double().tolist(), [rows, columns], 4, describe_mixture(reading)]
+    expected = fit_modes(heats, 4, xs, ys, readout=readout, merge=True)
+    asked = [heats.flatten(1).double().tolist(), [rows, columns], 4, describe_mixture(readout)]
     with serve(hollow) as address:
         chromium.goto(f"{address}/model.json")
         found = chromium.evaluate(ASK, asked)
@@ -145,7 +145,7 @@ def test_the_mixture_is_the_librarys_on_200_questions(
         apart = (state[order[0], :2] + centre - expected.modes[k, there].numpy()[order[1]]) * px_a_cell
         assert np.abs(apart).max() < 0.5  # px
         np.testing.assert_allclose(state[order[0], 2], expected.weights[k, there].numpy()[order[1]], atol=0.01)
-        assert fit["outside"] == pytest.approx(float(expected.outside[k]), abs=0.02)
+        assert fit["outside"] == pytest.approx(float(expected.outlier_mass[k]), abs=0.02)
 
 
 @in_browser

@@ -11,7 +11,7 @@ import pytest
 import mmgsd
 from mmgsd.__main__ import main
 from mmgsd.dataset import load_dataset
-from mmgsd.fold.agreement import Motion, to_complex, to_points
+from mmgsd.fold.consensus import Motion, to_complex, to_points
 from mmgsd.fold.demonstration import Demonstration, Look, write_demonstration
 from mmgsd.fold.moves import AGREE, BEST, answer_picture, choose_moves
 from mmgsd.match.match import Match

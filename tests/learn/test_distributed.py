@@ -19,7 +19,7 @@ from safetensors import safe_open
 from mmgsd.config import TrainConfig
 from mmgsd.learn import training
 from mmgsd.learn.checkpoints import CHECKPOINT
-from mmgsd.learn.distributed import Team, joined
+from mmgsd.learn.distributed import World, joined
 
 CONFIG = TrainConfig(steps=3, batch=4, groups=2, pairs=4, queries=16, input_px=64, descriptor_dim=8)
 SCRIPT = """
@@ -62,11 +62,11 @@ def test_two_processes_have_the_losses_and_gradients_of_one(tiny_dataset: Callab
 LISTENING = """
 import psutil
 from mmgsd.learn.distributed import joined
-with joined(2, "cpu") as team:
-    team.add(1.0)
+with joined(2, "cpu") as world:
+    world.add(1.0)
     there = psutil.Process().net_connections("inet")
     print("listens on", sorted({c.laddr.ip for c in there if c.status == psutil.CONN_LISTEN}), flush=True)
-    team.wait()
+    world.wait()
 """
 
 
@@ -88,6 +88,6 @@ def test_groups_are_shared_evenly(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_alone_a_process_has_all_groups() -> None:
-    with joined(3, "cpu") as team:
-        assert team == Team(torch.device("cpu"), (0, 1, 2))
-        assert team.add(1.5) == 1.5
+    with joined(3, "cpu") as world:
+        assert world == World(torch.device("cpu"), (0, 1, 2))
+        assert world.add(1.5) == 1.5

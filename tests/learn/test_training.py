@@ -95,7 +95,7 @@ def test_every_method_trains(cloth_dataset: Path, tmp_path: Path, method: str) -
     assert np.isfinite(log.loss).all()
     assert all(torch.isfinite(value).all() for value in load_file(weights).values())
     matcher = Matcher.load(weights, device="cpu")
-    assert (matcher.config, matcher.modes) == (config, 1 if method in ("pcl", "unimodal") else 4)
+    assert (matcher.config, matcher.num_modes) == (config, 1 if method in ("pcl", "unimodal") else 4)
     assert not (tmp_path / "model" / CHECKPOINT).exists()
 
 

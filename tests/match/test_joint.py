@@ -151,8 +151,8 @@ def test_a_joint_answer_holds_the_same_modes_in_another_order(asked) -> None:
     for name in ("weights", "visible", "spread_px"):
         one, other = (np.sort(getattr(match[apart], name), 1) for match in (together, alone))
         np.testing.assert_allclose(one, other, rtol=0.01)
-    assert alone.joint is None and together.joint.sum() == pytest.approx(1)
-    assert (np.diff(together.joint) <= 1e-6).all()
+    assert alone.joint_weights is None and together.joint_weights.sum() == pytest.approx(1)
+    assert (np.diff(together.joint_weights) <= 1e-6).all()
 
 
 def test_a_joint_answer_is_of_one_member_more_often_than_the_heaviest_modes(data: Dataset, asked) -> None:
@@ -167,7 +167,7 @@ def test_best_of_a_joint_answer_is_of_one_member(asked) -> None:
     xy = together.best().xy
     same = (np.linalg.norm(together.modes - xy[:, None], axis=-1) < 1e-3) | np.isnan(xy).any(1)[:, None]
     assert same.all(0).any()
-    assert together[:2].joint is together.joint
+    assert together[:2].joint_weights is together.joint_weights
 
 
 def test_fewer_joint_answers_are_the_first(data: Dataset, asked) -> None:
@@ -175,7 +175,7 @@ def test_fewer_joint_answers_are_the_first(data: Dataset, asked) -> None:
     images = data.load_image(0), data.load_image(1)
     one = mmgsd.load(data.object).match(*images, data.xy[0][points], joint=True, n=1)
     np.testing.assert_allclose(one.modes[:, 0], together.modes[:, 0], atol=1e-3)
-    assert one.weights.tolist() == [[1.0]] * len(points) and one.joint.tolist() == [1.0]
+    assert one.weights.tolist() == [[1.0]] * len(points) and one.joint_weights.tolist() == [1.0]
 
 
 @pytest.mark.parametrize("n", [0, 5, "auto", [1, 2], True])
@@ -193,7 +193,7 @@ def test_weights_without_a_mask_ask_for_the_users() -> None:
     with pytest.raises(ValueError, match="joint must be False, or mask0 be given: these weights of .* learnt no mask"):
         matcher.match(image, image, [(60, 60), (90, 90)], joint=True)
     match = matcher.match(image, image, [(60, 60), (90, 90)], joint=True, mask0=MASK)
-    assert match.joint.shape == (4,) and dataclasses.replace(match).modes.shape == (2, 4, 2)
+    assert match.joint_weights.shape == (4,) and dataclasses.replace(match).modes.shape == (2, 4, 2)
 
 
 @pytest.mark.parametrize("joint_", ["maybe", 2, None])
@@ -210,4 +210,4 @@ def test_no_pixel_or_one_is_answered_too(joint_: bool, mask: np.ndarray | None, 
     image = np.zeros((128, 128, 3), np.uint8)
     match = mmgsd.load("cloth").match(image, image, np.full((count, 2), 9.0), joint=joint_, mask0=mask)
     assert match.modes.shape == (count, 4, 2) and len(match.best().xy) == count
-    assert match.joint is None or match.joint.sum() == pytest.approx(1)
+    assert match.joint_weights is None or match.joint_weights.sum() == pytest.approx(1)

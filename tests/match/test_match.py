@@ -89,7 +89,7 @@ def five() -> Match:
 def test_some_queries_are_taken_as_numpy_does(five: Match, index: object, rows: list[int]) -> None:
     taken = five[index]
     assert len(taken) == len(rows)
-    for name in ("xy", "modes", "weights", "covariances", "entropy", "outside", "cells"):
+    for name in ("xy", "modes", "weights", "covariances", "entropy", "outlier_mass", "cells"):
         np.testing.assert_array_equal(getattr(taken, name), getattr(five, name)[rows])
     assert taken.heatmap.shape == (len(rows), 485, 485)
     assert taken.image0 is five.image0
@@ -147,7 +147,7 @@ def test_modes_that_are_seen_come_first_if_asked() -> None:
     unknown = dataclasses.replace(match, visible=None)
     assert unknown.seen_first() is unknown
     with pytest.raises(ValueError, match="joint"):
-        dataclasses.replace(match, joint=np.ones(3) / 3).seen_first()
+        dataclasses.replace(match, joint_weights=np.ones(3) / 3).seen_first()
 
 
 def test_where_nothing_shows_the_object_nothing_is_sure() -> None:

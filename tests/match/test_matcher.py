@@ -17,7 +17,7 @@ from mmgsd.dataset import load_dataset
 from mmgsd.match import matcher as matching
 from mmgsd.match.baselines import BaselineMatcher
 from mmgsd.match.matcher import Matcher, compute_entropy, compute_heatmap, load, make_match, read_heatmap
-from mmgsd.match.mixture import Mixture, Reading
+from mmgsd.match.mixture import Mixture, ModeReadout
 from mmgsd.measure.metrics import compute_query_errors
 from mmgsd.model.heads import Outputs
 from mmgsd.model.network import build_network, compute_cell_centres
@@ -82,9 +82,9 @@ def test_a_photograph_gives_one_answer_by_path_by_pillow_and_as_pixels(
 def test_modes_are_read_as_round_as_the_training_says(matcher: Matcher, monkeypatch: pytest.MonkeyPatch) -> None:
     asked, fit = [], matching.fit_modes
 
-    def listen(*arguments: object, reading: Reading, **others: object) -> Mixture:
-        asked.append(reading)
-        return fit(*arguments, reading=reading, **others)
+    def listen(*arguments: object, readout: ModeReadout, **others: object) -> Mixture:
+        asked.append(readout)
+        return fit(*arguments, readout=readout, **others)
 
     monkeypatch.setattr(matching, "fit_modes", listen)
     image = np.zeros((64, 64, 3), np.uint8)
@@ -92,7 +92,7 @@ def test_modes_are_read_as_round_as_the_training_says(matcher: Matcher, monkeypa
     config = dataclasses.replace(CONFIG, roundness=0.07)
     other = Matcher(matcher.network, config, modes=4, size=SIZE, device="cpu", power=1.5, sharpness=3.0)
     other.match(image, image, [(5, 5)])
-    assert asked == [Reading(0.2), Reading(0.07, 1.5, 3.0)]
+    assert asked == [ModeReadout(0.2), ModeReadout(0.07, 1.5, 3.0)]
 
 
 @pytest.fixture
@@ -217,7 +217,7 @@ def test_fewer_modes_are_the_most_probable_of_the_groups(matcher: Matcher, image
     np.testing.assert_array_equal(fewer.modes, every.modes[:, :2])
     np.testing.assert_array_equal(fewer.covariances, every.covariances[:, :2])
     np.testing.assert_allclose(fewer.weights, every.weights[:, :2] / every.weights[:, :2].sum(1, keepdims=True))
-    np.testing.assert_array_equal(fewer.outside, every.outside)
+    np.testing.assert_array_equal(fewer.outlier_mass, every.outlier_mass)
 
 
 def test_each_query_may_have_its_number_of_modes(matcher: Matcher, image: np.ndarray) -> None:

@@ -11,7 +11,7 @@ from sklearn.mixture import GaussianMixture
 from torch import Tensor
 
 from mmgsd.match import mixture
-from mmgsd.match.mixture import Reading, fit_modes
+from mmgsd.match.mixture import ModeReadout, fit_modes
 from mmgsd.measure.metrics import compute_mode_errors
 from mmgsd.model.network import compute_cell_centres
 
@@ -57,22 +57,22 @@ def test_less_of_a_prior_keeps_a_narrow_mode_out_of_a_wide_one() -> None:
     true = np.array([[200.0, 240.0], [290.0, 240.0]])
     heatmap = (draw_mixture(true[:1], 8.0) + draw_mixture(true[1:], 60.0)) / 2
     errors = [
-        measure_errors(fit_modes(heatmap, 2, XS, YS, reading=Reading(r)).modes[0], true) for r in (0.05, 0.2, 5.0)
+        measure_errors(fit_modes(heatmap, 2, XS, YS, readout=ModeReadout(r)).modes[0], true) for r in (0.05, 0.2, 5.0)
     ]
     assert errors[0].max() < errors[1].max() < errors[2].max()
 
 
-@pytest.mark.parametrize("roundness", [0.0, -1.0, float("nan")])
-def test_another_roundness_is_refused(roundness: float) -> None:
-    with pytest.raises(ValueError, match="roundness must be greater than 0, got"):
-        Reading(roundness)
+@pytest.mark.parametrize("shape_prior", [0.0, -1.0, float("nan")])
+def test_another_shape_prior_is_refused(shape_prior: float) -> None:
+    with pytest.raises(ValueError, match="shape_prior must be greater than 0, got"):
+        ModeReadout(shape_prior)
 
 
-@pytest.mark.parametrize("name", ["power", "sharpness"])
+@pytest.mark.parametrize("name", ["exponent", "mean_exponent"])
 @pytest.mark.parametrize("value", [0.9, 0.0, float("nan"), float("inf")])
 def test_modes_are_not_read_flatter_than_they_are(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=f"{name} must be at least 1, got"):
-        Reading(**{name: value})
+        ModeReadout(**{name: value})
 
 
 def draw_tails() -> torch.Tensor:
@@ -83,8 +83,8 @@ def draw_tails() -> torch.Tensor:
 
 
 def test_modes_follow_the_peaks_of_what_spreads_to_one_side() -> None:
-    readings = [Reading(), Reading(sharpness=4.0), Reading(power=2.0, sharpness=4.0)]
-    fits = [fit_modes(draw_tails(), 4, XS, YS, reading=reading) for reading in readings]
+    readouts = [ModeReadout(), ModeReadout(mean_exponent=4.0), ModeReadout(exponent=2.0, mean_exponent=4.0)]
+    fits = [fit_modes(draw_tails(), 4, XS, YS, readout=readout) for readout in readouts]
     plain, *others = (measure_errors(fit.modes[0], CORNERS).max() for fit in fits)
     assert plain > 20 and max(others) < 2
     assert fits[2].weights.sum() == pytest.approx(1, abs=1e-5)
@@ -94,7 +94,7 @@ def test_modes_follow_the_peaks_of_what_spreads_to_one_side() -> None:
 
 def test_absent_modes_stay_absent_however_modes_are_read() -> None:
     heatmaps = torch.cat([draw_mixture(CORNERS, 8.0), draw_mixture(CORNERS[:1], 8.0)])
-    fit = fit_modes(heatmaps, torch.tensor([4, 1]), XS, YS, reading=Reading(power=2.0, sharpness=3.0))
+    fit = fit_modes(heatmaps, torch.tensor([4, 1]), XS, YS, readout=ModeReadout(exponent=2.0, mean_exponent=3.0))
     assert fit.modes[1].isnan().sum(0).tolist() == [3, 3] and fit.weights[1].tolist() == [1, 0, 0, 0]
 
 
@@ -194,12 +194,12 @@ def test_an_oblong_mode_keeps_its_shape() -> None:
 
 
 def test_five_per_cent_lie_outside_the_ellipse() -> None:
-    assert fit_modes(draw_mixture(CORNERS, 24.0), 4, XS, YS).outside.item() == pytest.approx(0.05, abs=0.01)
+    assert fit_modes(draw_mixture(CORNERS, 24.0), 4, XS, YS).outlier_mass.item() == pytest.approx(0.05, abs=0.01)
 
 
 def test_a_place_without_a_mode_lies_outside() -> None:
     heatmap = draw_mixture(CORNERS[:2], 8.0, np.array([0.97, 0.03]))
-    assert fit_modes(heatmap, 1, XS, YS).outside.item() == pytest.approx(0.03, abs=0.02)
+    assert fit_modes(heatmap, 1, XS, YS).outlier_mass.item() == pytest.approx(0.03, abs=0.02)
 
 
 @pytest.mark.parametrize("std_px", [4.0, 8.0, 16.0, 32.0])
@@ -296,7 +296,7 @@ def test_fit_is_sound_on_any_heatmap(name: str, n: int) -> None:
     assert fit.weights.sum().item() == pytest.approx(1)
     assert (fit.weights[0].diff() <= 0).all()
     assert torch.linalg.eigvalsh(fit.covariances).min() > 0
-    assert 0 <= fit.outside.item() <= 1
+    assert 0 <= fit.outlier_mass.item() <= 1
 
 
 def test_one_cell_is_its_own_mode() -> None:

@@ -46,7 +46,7 @@ def test_a_place_by_name_is_found_in_an_image(matcher: Matcher, data: Dataset) -
         distances = []
         for index in range(len(data)):
             match = matcher.find(data.load_image(index), name)
-            assert match.modes.shape[:2] == (1, matcher.modes) or match.modes.shape[:2] == (1, len(orbit))
+            assert match.modes.shape[:2] == (1, matcher.num_modes) or match.modes.shape[:2] == (1, len(orbit))
             modes = match.modes[0][np.isfinite(match.modes[0]).all(1)]
             true = data.xy[index][orbit[data.visible[index, orbit]]]
             distances += np.linalg.norm(true[:, None] - modes, axis=-1).min(1).tolist()
@@ -62,7 +62,7 @@ def test_a_place_is_asked_for_as_a_pixel_is(matcher: Matcher, data: Dataset) -> 
     for answer in (*matcher.match_many([(None, image, names)]), matcher.prepare(None, image).match(names)):
         np.testing.assert_array_equal(match.modes, answer.modes)
     joint = matcher.find(image, names, joint=True)
-    assert joint.modes.shape == (len(names), matcher.modes, 2) and joint.joint.sum() == pytest.approx(1)
+    assert joint.modes.shape == (len(names), matcher.num_modes, 2) and joint.joint_weights.sum() == pytest.approx(1)
     assert match.plot() is not None
 
 

@@ -15,7 +15,7 @@ from safetensors import safe_open
 from mmgsd.config import TrainConfig
 from mmgsd.dataset import load_dataset
 from mmgsd.match.matcher import Matcher
-from mmgsd.match.mixture import Reading
+from mmgsd.match.mixture import ModeReadout
 from mmgsd.measure import calibration
 from mmgsd.measure.calibration import (
     BANDWIDTHS,
@@ -133,16 +133,16 @@ def test_unseen_images_choose_how_modes_are_read_as_well(
     tensors, note = read_tensors(weights)
     write_tensors(weights, tensors, note | {"data": "0123"})
 
-    def choose(matcher: Matcher, *_: object, **__: object) -> Reading:
-        matcher.reading = Reading(0.2, 1.5, 4.0)
-        return matcher.reading
+    def choose(matcher: Matcher, *_: object, **__: object) -> ModeReadout:
+        matcher.readout = ModeReadout(0.2, 1.5, 4.0)
+        return matcher.readout
 
-    monkeypatch.setattr(calibration, "choose_reading", choose)
+    monkeypatch.setattr(calibration, "choose_readout", choose)
     monkeypatch.setattr(calibration, "LEAST_PAIRS", 8)  # of four images
     how = {"pairs": 12, "points": 4, "progress": False}
     calibrate_unseen(weights, [cloth_dataset], **how)
     matcher, said = Matcher.load(weights, device="cpu"), load_metadata(weights)
-    assert matcher.reading == Reading(0.2, 1.5, 4.0) and matcher.calibration.pairs >= 8
+    assert matcher.readout == ModeReadout(0.2, 1.5, 4.0) and matcher.calibration.pairs >= 8
     assert json.loads(said["unseen"]) == [load_dataset(cloth_dataset, "test").fingerprint]
     stamp = weights.stat().st_mtime_ns
     calibrate_unseen(weights, [cloth_dataset], **how)

@@ -15,7 +15,7 @@ import torch
 from mmgsd.config import EvaluateConfig, TrainConfig
 from mmgsd.dataset import Dataset, load_dataset
 from mmgsd.match.matcher import Matcher
-from mmgsd.match.mixture import AS_IT_IS, Mixture, Reading
+from mmgsd.match.mixture import AS_IT_IS, Mixture, ModeReadout
 from mmgsd.measure import evaluation, questions
 from mmgsd.measure.evaluation import (
     BASELINES,
@@ -48,7 +48,7 @@ def write_weights(folder: Path, content: bytes = b"weights") -> Path:
 def answer_with_the_truth(group: str, shift: float) -> object:
     """Stands for a model that knows the labels: the true modes, moved by ``shift`` px along x."""
 
-    def make(matcher: object, data: Dataset, config: EvaluateConfig) -> questions.Answer:
+    def make(matcher: object, data: Dataset, config: EvaluateConfig) -> questions.AnswerFunction:
         def answer(first: int, second: int, xy: np.ndarray, n: np.ndarray) -> tuple[Mixture, torch.Tensor]:
             modes = np.full((len(xy), n.max(), 2), np.nan)
             for row, point in enumerate(choose_points(CONFIG.points, 625)):
@@ -234,9 +234,9 @@ def test_modes_are_read_as_round_as_the_training_says(cloth_dataset: Path, monke
     matcher = Matcher(build_network("lite0", 4, pretrained=False), config, modes=4, size=(485, 485), device="cpu")
     asked, read = [], questions.read_heatmap
 
-    def listen(*arguments: object, reading: Reading) -> tuple[Mixture, torch.Tensor]:
-        asked.append(reading.roundness)
-        return read(*arguments, reading=reading)
+    def listen(*arguments: object, readout: ModeReadout) -> tuple[Mixture, torch.Tensor]:
+        asked.append(readout.shape_prior)
+        return read(*arguments, readout=readout)
 
     monkeypatch.setattr(questions, "read_heatmap", listen)
     measure_rmse(matcher, load_dataset(cloth_dataset), pairs=2, points=5)

@@ -50,7 +50,7 @@ def test_no_model_holds_or_trains_the_backbone(images: torch.Tensor) -> None:
     assert sum(value.numel() for value in network.state_dict().values()) < 3e6  # 22e6 with it
     outputs = network.describe(images)
     assert outputs.descriptors.shape == (2, 16, 28, 28)
-    (outputs.descriptors.square().mean() + outputs.mask.square().mean() + outputs.present.mean()).backward()
+    (outputs.descriptors.square().mean() + outputs.mask.square().mean() + outputs.presence.mean()).backward()
     config = TrainConfig(network="dinov2s", heads=True, input_px=224, optimiser="muon")
     for optimiser in make_optimisers(network, [], config):
         optimiser.step()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from mmgsd.model.heads import Heads, compute_judge_loss, compute_mask_loss, compute_present_loss, look_up
+from mmgsd.model.heads import Heads, compute_mask_loss, compute_presence_loss, compute_visibility_loss, look_up
 from mmgsd.model.network import build_network
 
 
@@ -15,12 +15,12 @@ from mmgsd.model.network import build_network
 def test_shapes_of_what_a_network_says(name: str, stride: int, mask_stride: int) -> None:
     network = build_network(name, 8, roles=2, heads=True, pretrained=False).eval()
     with torch.inference_mode():
-        said = network.describe(torch.rand(2, 3, 128, 192))
+        outputs = network.describe(torch.rand(2, 3, 128, 192))
         plain = network(torch.rand(2, 3, 128, 192))
-    assert said.descriptors.shape == plain.shape == (2, 16, 128 // stride, 192 // stride)
-    assert said.mask.shape == (2, 128 // mask_stride, 192 // mask_stride)
-    assert said.surface.shape[2:] == said.descriptors.shape[2:]
-    assert said.present.shape == (2,)
+    assert outputs.descriptors.shape == plain.shape == (2, 16, 128 // stride, 192 // stride)
+    assert outputs.mask.shape == (2, 128 // mask_stride, 192 // mask_stride)
+    assert outputs.surface.shape[2:] == outputs.descriptors.shape[2:]
+    assert outputs.presence.shape == (2,)
 
 
 def test_heads_change_no_descriptor() -> None:
@@ -32,8 +32,8 @@ def test_heads_change_no_descriptor() -> None:
 
 
 def test_without_heads_nothing_more_is_said() -> None:
-    said = build_network("lite0", 8, pretrained=False).eval().describe(torch.rand(1, 3, 64, 64))
-    assert said.mask is None and said.surface is None and said.present is None
+    outputs = build_network("lite0", 8, pretrained=False).eval().describe(torch.rand(1, 3, 64, 64))
+    assert outputs.mask is None and outputs.surface is None and outputs.presence is None
 
 
 def test_heads_are_put_onto_trained_weights_and_not_taken_off() -> None:
@@ -53,8 +53,8 @@ def test_mask_loss_by_hand() -> None:
 
 def test_absent_images_count_ten_times() -> None:
     logits = torch.tensor([0.0, 0.0])
-    present = compute_present_loss(logits, torch.tensor([True, True]))
-    mixed = compute_present_loss(logits, torch.tensor([True, False]))
+    present = compute_presence_loss(logits, torch.tensor([True, True]))
+    mixed = compute_presence_loss(logits, torch.tensor([True, False]))
     assert mixed.item() == pytest.approx(5.5 * present.item())
 
 
@@ -63,18 +63,18 @@ def test_seen_and_unseen_places_weigh_as_much() -> None:
     seen = torch.tensor([True, False, False, False, False])
     counted = torch.tensor([True, True, True, True, False])
     expected = (np.log1p(np.exp(-2.0)) + np.log1p(np.exp(-1.0))) / 2
-    assert compute_judge_loss(logits, seen, counted).item() == pytest.approx(expected, abs=1e-6)
+    assert compute_visibility_loss(logits, seen, counted).item() == pytest.approx(expected, abs=1e-6)
 
 
 def test_nothing_to_judge_is_no_loss() -> None:
     nothing = torch.zeros(3, dtype=torch.bool)
-    assert compute_judge_loss(torch.ones(3), nothing, nothing).item() == 0
+    assert compute_visibility_loss(torch.ones(3), nothing, nothing).item() == 0
 
 
 @pytest.mark.parametrize("roles", [1, 2])
 def test_the_judge_takes_any_leading_shape(roles: int) -> None:
     heads = Heads(8, 4, roles)
-    logits = heads.judge(torch.rand(2, 5, 1, 4), torch.rand(2, 5, 3, 4 * roles), torch.rand(2, 5, 3, 16))
+    logits = heads.visibility(torch.rand(2, 5, 1, 4), torch.rand(2, 5, 3, 4 * roles), torch.rand(2, 5, 3, 16))
     assert logits.shape == (2, 5, 3)
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from mmgsd.files import write_json
 from mmgsd.fold.demonstration import Look, read_demonstration
-from mmgsd.fold.moves import Answer
+from mmgsd.fold.moves import PolicyAnswer
 from mmgsd.fold.state import State, read_state, write_state
 from mmgsd.fold.tasks import GROUNDS, TASKS
 from mmgsd.studies import folding as rollouts
@@ -226,9 +226,9 @@ def test_a_policy_that_is_unsure_looks_again_and_keeps_the_surest_look(
     shares = {"": 0.4, "-look1": 0.6, "-look2": 0.5}
     policy = POLICIES["mmgsd_again"]
 
-    def say(bench: rollouts.Bench, *asked: object) -> Answer:
+    def say(bench: rollouts.Bench, *asked: object) -> PolicyAnswer:
         look = asked[3].about.get("again", 0)
-        return Answer(np.zeros((0, 2, 2)), None, shares[f"-look{look}" if look else ""])
+        return PolicyAnswer(np.zeros((0, 2, 2)), None, shares[f"-look{look}" if look else ""])
 
     monkeypatch.setattr(rollouts.Bench, "_ask", say)
     bench = rollouts.Bench(tmp_path, {"progress": False})

@@ -168,10 +168,10 @@ def _choose_orbits(candidates: np.ndarray, transforms: list[np.ndarray]) -> np.n
     chosen = np.empty((0, 3))
     for candidate in candidates:
         moved = np.stack([t @ candidate for t in transforms])
-        apart = np.linalg.norm(moved[:, None] - moved[None], axis=-1)
-        first = np.array([not (apart[i, :i] < 1e-6).any() for i in range(len(moved))])  # a fixed point counts once
+        distance = np.linalg.norm(moved[:, None] - moved[None], axis=-1)
+        first = np.array([not (distance[i, :i] < 1e-6).any() for i in range(len(moved))])  # a fixed point counts once
         orbit = moved[first]
-        gaps = apart[np.ix_(first, first)] + np.eye(len(orbit))
+        gaps = distance[np.ix_(first, first)] + np.eye(len(orbit))
         if gaps.min() > 0.55 * SPACING and (not len(chosen) or _gap(chosen, orbit) > 0.55 * SPACING):
             chosen = np.concatenate([chosen, orbit])
     return chosen

@@ -179,9 +179,9 @@ def _sample_plan(
 def _is_suitable(xy: np.ndarray, pairs: np.ndarray, angles: np.ndarray) -> bool:
     """Whether a planar curve's crossings are steep and clear of each other and of the ends."""
     passes = np.sort(np.concatenate([[0, len(xy) - 1], pairs.ravel()]))
-    apart = np.diff(passes).min() * STEP >= 2.0
+    separate = np.diff(passes).min() * STEP >= 2.0
     ends = passes[1] * STEP >= 2.5 and (len(xy) - 1 - passes[-2]) * STEP >= 2.5
-    return bool(apart and ends and (angles > np.radians(40)).all() and _clear_enough(xy, pairs))
+    return bool(separate and ends and (angles > np.radians(40)).all() and _clear_enough(xy, pairs))
 
 
 def _clear_enough(xy: np.ndarray, pairs: np.ndarray) -> bool:

@@ -14,7 +14,7 @@ RGB = tuple[int, int, int]
 Draw = Callable[[np.random.Generator], RGB]
 
 COLOURS = 1000  # drawn at most for one that is unlike another
-TABLES = (
+TABLE_COLOURS = (
     (196, 154, 108), (160, 110, 66), (222, 188, 140), (110, 72, 46), (240, 240, 238), (225, 225, 228), (200, 200, 200),
     (150, 152, 156), (100, 102, 106), (60, 62, 66), (24, 24, 26), (176, 164, 146), (60, 90, 70), (58, 78, 120),
 )  # fmt: skip
@@ -80,7 +80,7 @@ def draw_table_rgb(rng: np.random.Generator) -> RGB:
     """A colour as tables and floors have them: wood, white, grey, black, or any."""
     if rng.random() < 0.4:
         return draw_rgb(rng)
-    return vary_rgb(rng, TABLES[rng.integers(len(TABLES))], 0.12)
+    return vary_rgb(rng, TABLE_COLOURS[rng.integers(len(TABLE_COLOURS))], 0.12)
 
 
 def draw_other_rgb(rng: np.random.Generator, other: RGB, *, distance: float = 60.0, draw: Draw = draw_rgb) -> RGB:

@@ -1,4 +1,4 @@
-"""How modes are best read from the heatmaps of trained weights (`mmgsd.match.mixture.Reading`), by renders held out.
+"""How modes are best read from heatmaps of trained weights (`mmgsd.match.mixture.ModeReadout`), by renders held out.
 
 What counts is what a robot can grasp: `mmgsd.measure.photographs` asks the same of photographs, which choose nothing.
 """
@@ -16,7 +16,7 @@ from mmgsd.config import EvaluateConfig
 from mmgsd.dataset import Dataset
 from mmgsd.match.match import RADIUS_PX
 from mmgsd.match.matcher import Matcher
-from mmgsd.match.mixture import AS_IT_IS, Reading, fit_modes
+from mmgsd.match.mixture import AS_IT_IS, ModeReadout, fit_modes
 from mmgsd.measure.metrics import compute_query_errors
 from mmgsd.measure.questions import choose_points, describe, draw_pairs
 from mmgsd.model.network import compute_cell_centres
@@ -48,9 +48,9 @@ class Quality(NamedTuple):
         return self.found - self.spurious
 
 
-def choose_reading(
+def choose_readout(
     matcher: Matcher, data: Dataset, *, pairs: int = 120, points: int = 40, seed: int = 0, progress: bool = False
-) -> Reading:
+) -> ModeReadout:
     """The reading that finds the most matches that are seen in ``data``, which must not have been trained on.
 
     Of `POWERS` and `SHARPNESSES` that with the largest found share less the spurious one, as `count_seen` counts them,
@@ -58,34 +58,34 @@ def choose_reading(
     """
     config = EvaluateConfig(pairs=pairs, points=points, seed=seed)
     asked = list(_ask(matcher, data, config))
-    roundness = matcher.reading.roundness
-    readings = [Reading(roundness, power, sharpness) for power in POWERS for sharpness in SHARPNESSES]
-    bar = ProgressBar(readings, desc="choose a reading", disable=not progress, leave=False)
-    quality = {reading: measure_reading(asked, reading, data.size) for reading in bar}
-    least = quality[Reading(roundness, AS_IT_IS.power, AS_IT_IS.sharpness)].rmse_px
-    allowed = [reading for reading in readings if quality[reading].rmse_px <= ALLOWED * least]
-    matcher.reading = max(allowed, key=lambda reading: quality[reading].gain)
-    return matcher.reading
+    roundness = matcher.readout.shape_prior
+    readouts = [ModeReadout(roundness, power, sharpness) for power in POWERS for sharpness in SHARPNESSES]
+    bar = ProgressBar(readouts, desc="choose a reading", disable=not progress, leave=False)
+    quality = {readout: measure_readout(asked, readout, data.size) for readout in bar}
+    least = quality[ModeReadout(roundness, AS_IT_IS.exponent, AS_IT_IS.mean_exponent)].rmse_px
+    allowed = [readout for readout in readouts if quality[readout].rmse_px <= ALLOWED * least]
+    matcher.readout = max(allowed, key=lambda readout: quality[readout].gain)
+    return matcher.readout
 
 
 def _ask(matcher: Matcher, data: Dataset, config: EvaluateConfig) -> Iterator[Asked]:
     """Of each pair the points that are seen in its first image."""
     chosen, points = draw_pairs(data, config), choose_points(config.points, data.n_points)
-    said, group = describe(matcher, data, np.unique(chosen)), data.group(matcher.config.group).permutations
+    outputs, group = describe(matcher, data, np.unique(chosen)), data.group(matcher.config.group).permutations
     points = points[[len(np.unique(group[:, point])) == len(group) for point in points]]  # none of a symmetry's centre
     for first, second in chosen:
         shown = points[data.visible[first, points]]
         if len(shown):
             xy, orbits = torch.from_numpy(data.xy[first, shown]), group[:, shown].T  # (S, 2), (S, n)
-            heatmaps = matcher.compute_heatmaps(said[first], said[second], xy, data.size)
+            heatmaps = matcher.compute_heatmaps(outputs[first], outputs[second], xy, data.size)
             yield Asked(heatmaps, data.xy[second][orbits].astype(float), data.visible[second][orbits])
 
 
-def measure_reading(asked: list[Asked], reading: Reading, size: tuple[int, int]) -> Quality:
+def measure_readout(asked: list[Asked], readout: ModeReadout, size: tuple[int, int]) -> Quality:
     """What a reading gives on questions about images of one ``size`` (width, height) px."""
     errors, found, spurious = [], [], []
     for heatmaps, true, seen in asked:
-        fit = fit_modes(heatmaps, true.shape[1], *compute_cell_centres(size, heatmaps.shape[-2:]), reading=reading)
+        fit = fit_modes(heatmaps, true.shape[1], *compute_cell_centres(size, heatmaps.shape[-2:]), readout=readout)
         modes, covariances = (t.double().cpu().numpy() for t in (fit.modes, fit.covariances))
         errors.append(compute_query_errors(modes, covariances, true)["rmse_px"])
         shares = count_seen(modes, true, seen)

@@ -29,7 +29,7 @@ class Motion:
 
 
 @dataclass(frozen=True, eq=False)
-class Agreement:
+class Consensus:
     """The motion that most answers agree with, how many of the questions do, and each one's mode."""
 
     motion: Motion
@@ -48,9 +48,9 @@ def to_points(numbers: np.ndarray) -> np.ndarray:
     return np.stack([np.real(numbers), np.imag(numbers)], -1)
 
 
-def find_agreement(
+def find_consensus(
     asked: np.ndarray, modes: np.ndarray, weights: np.ndarray, *, free_scale: bool = False
-) -> Agreement | None:
+) -> Consensus | None:
     """The agreement of modes (S, n, 2) with weights (S, n) about ``asked`` (S, 2), one unit for all; None of none.
 
     Every two questions and their modes propose a motion, with their distance's scale where ``free_scale``; the one
@@ -72,7 +72,7 @@ def find_agreement(
         motion = _fit(source, target, near, motion, free_scale)
     near = _weigh(motion, source, target, weights, 2 * RADIUS * extent)
     chosen = np.where(near.max(1) > 0, near.argmax(1), -1)
-    return Agreement(Motion(*map(complex, motion)), float(np.mean(chosen >= 0)), chosen)
+    return Consensus(Motion(*map(complex, motion)), float(np.mean(chosen >= 0)), chosen)
 
 
 def _propose(source: np.ndarray, target: np.ndarray, free_scale: bool) -> np.ndarray:
@@ -129,7 +129,7 @@ def find_extent(points: np.ndarray) -> float:
     return float(np.linalg.norm(points - points.mean(0), axis=1).max()) if len(points) else 0.0
 
 
-def settle_motion(asked: np.ndarray, modes: np.ndarray, motion: Motion, *, free_scale: bool = False) -> Motion:
+def refine_motion(asked: np.ndarray, modes: np.ndarray, motion: Motion, *, free_scale: bool = False) -> Motion:
     """The motion that best takes each question of (S, 2) to the nearest of its modes (S, n, 2), found from another one.
 
     For an object that is bent otherwise than shown: all questions count, not those alone that agree. Besl and McKay, "A
@@ -150,15 +150,15 @@ def _take_nearest(wanted: np.ndarray, modes: np.ndarray) -> np.ndarray:
     return modes[np.arange(len(modes)), distance.argmin(1)]
 
 
-def take_apart(asked: np.ndarray, modes: np.ndarray, motion: Motion, *, apart: float) -> np.ndarray:
+def assign_grasps(asked: np.ndarray, modes: np.ndarray, motion: Motion, *, min_distance: float) -> np.ndarray:
     """(S, 2): the mode of (S, n, 2) that each question of (S, 2) takes, near to where the motion takes it.
 
-    No two take places less than ``apart`` from each other, unless the motion takes them there: whose second choice is
-    worst chooses first, and what is taken is no choice of the others; none (NaN) where nothing is left.
+    No two take places less than ``min_distance`` from each other, unless the motion takes them there: whose second
+    choice is worst chooses first, and what is taken is no choice of the others; none (NaN) where nothing is left.
     """
     wanted, taken = motion.apply(asked), np.full((len(asked), 2), np.nan)
     distance = np.nan_to_num(np.linalg.norm(modes - wanted[:, None], axis=-1), nan=np.inf)  # (S, n)
-    allowed = np.minimum(apart, np.linalg.norm(wanted[:, None] - wanted, axis=-1) / 2)  # (S, S)
+    allowed = np.minimum(min_distance, np.linalg.norm(wanted[:, None] - wanted, axis=-1) / 2)  # (S, S)
     left = set(range(len(asked)))
     while left := {k for k in left if np.isfinite(distance[k]).any()}:
         k = max(sorted(left), key=lambda k: _find_regret(distance[k]))

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mmgsd.fold.agreement import (
+from mmgsd.fold.consensus import (
     Motion,
-    find_agreement,
+    assign_grasps,
+    find_consensus,
     fit_motion_to,
-    settle_motion,
-    take_apart,
+    refine_motion,
     to_complex,
     to_points,
 )
@@ -33,7 +33,7 @@ def chosen_places(found, modes):
 def test_all_questions_are_turned_alike(rng: np.random.Generator) -> None:
     for _ in range(20):
         modes, weights = answer(rng, noise=0.005)
-        found = find_agreement(ASKED, modes, weights)
+        found = find_consensus(ASKED, modes, weights)
         quarters = np.angle(found.motion.factor / TRUTH.factor) / (np.pi / 2)
         assert quarters == pytest.approx(round(quarters), abs=0.03) and found.share == 1
         np.testing.assert_allclose(chosen_places(found, modes), found.motion.apply(ASKED), atol=0.03)
@@ -43,7 +43,7 @@ def test_the_more_probable_of_like_turns_is_chosen(rng: np.random.Generator) -> 
     modes, weights = answer(rng)
     nearest = np.linalg.norm(modes - TRUTH.apply(ASKED)[:, None], axis=-1).argmin(1)
     weights[np.arange(len(modes)), nearest] = 0.5
-    found = find_agreement(ASKED, modes, weights)
+    found = find_consensus(ASKED, modes, weights)
     np.testing.assert_allclose(found.motion.apply(ASKED), TRUTH.apply(ASKED), atol=1e-6)
 
 
@@ -51,7 +51,7 @@ def test_wrong_and_absent_modes_are_outvoted(rng: np.random.Generator) -> None:
     modes, weights = answer(rng)
     modes[4] = rng.uniform(2, 3, (4, 2))
     modes[5, 1:] = np.nan
-    found = find_agreement(ASKED, modes, weights)
+    found = find_consensus(ASKED, modes, weights)
     assert found.chosen[4] == -1 and found.share in (4 / 6, 5 / 6)
     quarters = np.angle(found.motion.factor / TRUTH.factor) / (np.pi / 2)
     assert quarters == pytest.approx(round(quarters), abs=1e-6)
@@ -59,19 +59,19 @@ def test_wrong_and_absent_modes_are_outvoted(rng: np.random.Generator) -> None:
 
 def test_the_scale_is_free_where_no_camera_tells_it(rng: np.random.Generator) -> None:
     modes, weights = answer(rng, motion=Motion(300 * TRUTH.factor, 250 + 240j))
-    assert find_agreement(ASKED, modes, weights) is None
-    found = find_agreement(ASKED, modes, weights, free_scale=True)
+    assert find_consensus(ASKED, modes, weights) is None
+    found = find_consensus(ASKED, modes, weights, free_scale=True)
     assert abs(found.motion.factor) == pytest.approx(300, rel=1e-6) and found.share == 1
 
 
 def test_nothing_agrees_with_no_modes() -> None:
-    assert find_agreement(ASKED, np.full((6, 4, 2), np.nan), np.full((6, 4), 0.25)) is None
+    assert find_consensus(ASKED, np.full((6, 4, 2), np.nan), np.full((6, 4), 0.25)) is None
 
 
 @pytest.mark.parametrize("asked", [ASKED[:1], ASKED[[0, 0]], ASKED[:0]])
 def test_one_place_tells_no_motion(asked: np.ndarray) -> None:
     with pytest.raises(ValueError, match="asked must be at least two places"):
-        find_agreement(asked, np.zeros((len(asked), 4, 2)), np.ones((len(asked), 4)))
+        find_consensus(asked, np.zeros((len(asked), 4, 2)), np.ones((len(asked), 4)))
 
 
 def test_a_motion_is_fitted_by_least_squares(rng: np.random.Generator) -> None:
@@ -87,18 +87,18 @@ STRAIGHT = np.array([[-0.8, 0.0], [-0.4, 0.0], [0.0, 0.0], [0.4, 0.0], [0.8, 0.0
 
 def test_of_an_object_bent_otherwise_all_questions_count() -> None:
     modes = np.stack([BENT, BENT[::-1]], 1)  # (5, 2, 2)
-    found = settle_motion(STRAIGHT, modes, Motion(np.exp(0.3j), 0.1 + 0.4j))
+    found = refine_motion(STRAIGHT, modes, Motion(np.exp(0.3j), 0.1 + 0.4j))
     best = fit_motion_to(STRAIGHT, BENT)
     np.testing.assert_allclose(found.apply(STRAIGHT), best.apply(STRAIGHT), atol=1e-9)
     modes[1:] = np.nan
     start = Motion(1 + 0j, 0j)
-    assert settle_motion(STRAIGHT, modes, start) is start  # one question tells no motion
+    assert refine_motion(STRAIGHT, modes, start) is start  # one question tells no motion
 
 
 def test_no_two_questions_take_the_same_place() -> None:
     ends = STRAIGHT[[0, 4]]
     modes = np.stack([ends, ends], 0)  # both may be at either end
     aside = Motion(1 + 0j, 0.9 + 0j)  # both are nearer to the right end
-    assert take_apart(ends, modes, aside, apart=0.1).tolist() == [[-0.8, 0.0], [0.8, 0.0]]
-    taken = take_apart(ends, modes[:, 1:], aside, apart=0.1)  # only the right end is known
+    assert assign_grasps(ends, modes, aside, min_distance=0.1).tolist() == [[-0.8, 0.0], [0.8, 0.0]]
+    taken = assign_grasps(ends, modes[:, 1:], aside, min_distance=0.1)  # only the right end is known
     assert np.isfinite(taken).all(1).sum() == 1

@@ -11,9 +11,9 @@ import torch
 from mmgsd.config import TrainConfig
 from mmgsd.dataset import load_dataset
 from mmgsd.match.matcher import Matcher
-from mmgsd.match.mixture import Reading
-from mmgsd.measure import reading
-from mmgsd.measure.reading import ALLOWED, POWERS, SHARPNESSES, Asked, Quality, choose_reading, count_seen
+from mmgsd.match.mixture import ModeReadout
+from mmgsd.measure import readout
+from mmgsd.measure.readout import ALLOWED, POWERS, SHARPNESSES, Asked, Quality, choose_readout, count_seen
 from mmgsd.model.network import build_network
 
 
@@ -38,25 +38,26 @@ def test_only_matches_that_are_seen_count() -> None:
 def test_a_reading_that_costs_too_much_error_is_not_chosen(
     matcher: Matcher, cloth_dataset: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def measure(asked: list[Asked], tried: Reading, size: tuple[int, int]) -> Quality:
-        return Quality(10 * (1 + 0.01 * (tried.power - 1) * tried.sharpness), 0.1 * tried.power * tried.sharpness, 0.0)
+    def measure(asked: list[Asked], tried: ModeReadout, size: tuple[int, int]) -> Quality:
+        a, b = tried.exponent, tried.mean_exponent
+        return Quality(10 * (1 + 0.01 * (a - 1) * b), 0.1 * a * b, 0.0)
 
-    monkeypatch.setattr(reading, "measure_reading", measure)
-    chosen = choose_reading(matcher, load_dataset(cloth_dataset, "test"), pairs=2, points=4)
-    assert chosen == matcher.reading == Reading(matcher.config.roundness, 1.5, 8.0)
+    monkeypatch.setattr(readout, "measure_readout", measure)
+    chosen = choose_readout(matcher, load_dataset(cloth_dataset, "test"), pairs=2, points=4)
+    assert chosen == matcher.readout == ModeReadout(matcher.config.roundness, 1.5, 8.0)
     assert 1 + 0.01 * 0.5 * 8 <= ALLOWED < 1 + 0.01 * 8
 
 
 def test_a_reading_is_chosen_by_images(matcher: Matcher, cloth_dataset: Path) -> None:
     data = load_dataset(cloth_dataset, "test")
-    chosen = choose_reading(matcher, data, pairs=2, points=9)
-    assert chosen.power in POWERS and chosen.sharpness in SHARPNESSES
-    assert chosen == choose_reading(matcher, data, pairs=2, points=9)
+    chosen = choose_readout(matcher, data, pairs=2, points=9)
+    assert chosen.exponent in POWERS and chosen.mean_exponent in SHARPNESSES
+    assert chosen == choose_readout(matcher, data, pairs=2, points=9)
 
 
 def test_the_points_of_a_symmetrys_centre_are_not_asked(matcher: Matcher, cloth_dataset: Path) -> None:
     data = load_dataset(cloth_dataset, "test")
-    config = reading.EvaluateConfig(pairs=2, points=625)
-    for asked in reading._ask(matcher, data, config):
+    config = readout.EvaluateConfig(pairs=2, points=625)
+    for asked in readout._ask(matcher, data, config):
         assert asked.heatmaps.shape[0] == len(asked.true) == len(asked.seen) <= 624
         assert asked.true.shape[1:] == (4, 2)
