@@ -18,7 +18,7 @@ from safetensors.torch import load_file
 
 from mmgsd.config import EvaluateConfig, TrainConfig, load_preset
 from mmgsd.dataset import check_dataset
-from mmgsd.dataset_format import TABLES
+from mmgsd.dataset_format import DATASET_FILES
 from mmgsd.extras import shipping
 from mmgsd.files import DamagedFileError
 from mmgsd.learn import training
@@ -80,9 +80,9 @@ def trained(cloth_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
 def of_data_set(name: str) -> Callable[..., None]:
     def use(folder: Path, damage: Callable[[bytes], bytes], dataset: Path, model: Path) -> None:
         copy = shutil.copytree(dataset, folder / "cloth")
-        info = json.loads((copy / TABLES[0]).read_text())
-        digest = hashlib.sha256((copy / TABLES[1]).read_bytes()).hexdigest()
-        (copy / TABLES[0]).write_text(json.dumps({**info, "labels_sha256": digest}))
+        info = json.loads((copy / DATASET_FILES[0]).read_text())
+        digest = hashlib.sha256((copy / DATASET_FILES[1]).read_bytes()).hexdigest()
+        (copy / DATASET_FILES[0]).write_text(json.dumps({**info, "labels_sha256": digest}))
         path = copy / name
         path.write_bytes(damage(path.read_bytes()))
         check_dataset(copy)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from mmgsd import cli
-from mmgsd.__main__ import make_parser
+from mmgsd.__main__ import COMMANDS
 from mmgsd.command import Option
 from mmgsd.files import write_text
 
@@ -59,9 +59,9 @@ def _list_entries(place: str) -> Iterator[tuple[str, str, str]]:
 
 
 def _list_commands() -> Iterator[tuple[str, str]]:
-    for action in make_parser()._actions:
-        for name in action.choices or ():
-            yield name, inspect.getdoc(getattr(cli, name))
+    for name, (place, _) in COMMANDS.items():
+        if place.startswith("cli."):  # what asks weights
+            yield name, inspect.getdoc(getattr(cli, name)).partition("\n\n")[0]
 
 
 def _sign(thing: Any) -> str:

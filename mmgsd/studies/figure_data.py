@@ -27,7 +27,8 @@ EXAMPLE_QUALITY = 90  # of the example's images, JPEG
 TRUE = "true{}"  # the tensors of the queries' true matches: true, true1, …
 _SUMMARY = ("mean_px", "histogram")  # and asked, which all methods share
 _IMAGES = ("image0", "image1")
-_ANSWER = ("modes", "weights", "covariances", "entropy", "outside", "cells")
+_ANSWER = {name: name for name in ("modes", "weights", "covariances", "entropy", "cells")}  # field: tensor of a file
+_ANSWER |= {"outlier_mass": "outside"}
 
 
 @dataclass(frozen=True)
@@ -144,7 +145,7 @@ def save_figure_data(data: FigureData, path: Path) -> Path:
         tensors |= {f"errors/{method}/{name}": getattr(summary, name) for name in _SUMMARY}
     tensors["xy"] = example.xy
     for method, match in data.answers.items():
-        tensors |= {f"{method}/{name}": np.asarray(getattr(match, name), np.float32) for name in _ANSWER}
+        tensors |= {f"{method}/{n}": np.asarray(getattr(match, field), np.float32) for field, n in _ANSWER.items()}
     note = {"methods": list(data.errors), "models": list(data.answers), "object_size_px": data.object_size_px}
     packed = save({n: np.ascontiguousarray(t) for n, t in tensors.items()}, {"figures": json.dumps(note)})
     return write_bytes(path, packed)
@@ -162,7 +163,8 @@ def load_figure_data(path: Path) -> FigureData:
         errors = {m: ErrorSummary(tensors["asked"], *summary) for m, summary in summaries.items()}
         images = {n: cv2.cvtColor(cv2.imdecode(tensors[n], cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB) for n in _IMAGES}
         shared = {**images, "xy": tensors["xy"]}
-        answers = {m: Match(**shared, **{n: tensors[f"{m}/{n}"] for n in _ANSWER}) for m in note["models"]}
+        answers = {m: Match(**shared, **{field: tensors[f"{m}/{n}"] for field, n in _ANSWER.items()})
+                   for m in note["models"]}  # fmt: skip
         true = [tensors[TRUE.format(k or "")] for k in range(sum(name.startswith("true") for name in tensors))]
         return FigureData(errors, float(note["object_size_px"]), answers, true)
     except (SafetensorError, OSError, KeyError, TypeError, ValueError, AttributeError, cv2.error) as error:
