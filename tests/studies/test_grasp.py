@@ -107,7 +107,7 @@ def test_a_run_lifts_what_is_grasped_at_a_corner(tmp_path: Path, monkeypatch: py
     for module in (grasp, rollouts):
         monkeypatch.setattr(module, "run_jobs", run)
     monkeypatch.setattr(grasp, "load", lambda _: Sure())
-    results = json.loads(run(Paths(tmp_path, "smoke"), progress=False).read_text())
+    results = json.loads(grasp.run(Paths(tmp_path, "smoke"), progress=False).read_text())
     assert list(results) == list(grasp.MATCHERS)
     ways = results["mmgsd"]
     assert ways["surest"]["lifted"]["mean"] == 1 and ways["probable"]["lifted"]["mean"] == 0
