@@ -156,7 +156,8 @@ def _open_runtime(runtime: Path | str | None) -> Iterator[Path]:
                                 f"runtime, unpacked from the archive that `npm pack {PACKAGE}@{VERSION}` writes on "
                                 "another machine")  # fmt: skip
     with TemporaryDirectory() as folder:
-        command = [npm, "pack", f"{PACKAGE}@{VERSION}", "--silent", "--pack-destination", folder]
+        command = [npm, "pack", f"{PACKAGE}@{VERSION}", "--silent", "--fetch-retries", "1",
+               "--pack-destination", folder]  # fmt: skip
         done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
         archives = list(Path(folder).glob("*.tgz"))
         if done.returncode or len(archives) != 1:
