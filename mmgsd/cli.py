@@ -166,7 +166,7 @@ def find(
     """Find places of the object by name, without a first image."""
     _check_order(joint, seen_first)
     shown = mmgsd.read_image(image)
-    answer = mmgsd.load(weights).find(shown, places, joint=joint, mask=mask and read_mask(mask, shown.shape[:2]))
+    answer = mmgsd.load(weights).find(shown, list(places), joint=joint, mask=mask and read_mask(mask, shown.shape[:2]))
     answer = answer.seen_first() if seen_first else answer
     described = [{"place": place, **query} for place, query in zip(places, describe_answer(answer), strict=True)]
     if out:

@@ -78,7 +78,7 @@ def run_command(main: Callable[[], None], *, kept: str = KEPT) -> None:
     try:
         main()
     except KeyboardInterrupt as stopped:
-        _leave(f"stopped: {stopped or kept}", 130)
+        _leave(f"stopped: {str(stopped) or kept}", 130)
     except BrokenPipeError:  # who reads the output has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except Exception as error:

@@ -69,7 +69,7 @@ def trained(cloth_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     folder = tmp_path_factory.mktemp("trained")
     kept = folder / "kept"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(training._Run, "finish", lambda run, weights: run.save())
+        patch.setattr(training.Run, "finish", lambda run, weights: run.save())
         train_model(CONFIG, cloth_dataset, folder / "model", device="cpu", progress=False)
         kept.write_bytes((folder / "model" / CHECKPOINT).read_bytes())
     train_model(CONFIG, cloth_dataset, folder / "model", device="cpu", progress=False)

@@ -24,10 +24,11 @@ top left one (0, 0); S counts the pixels asked about, n their modes. `pip instal
 PARTS = {  # title: names below `mmgsd`, of classes with all their public members
     "Loading": ("load", "read_image", "find_samples", "compute_rays"),
     "Asking": ("match.matcher.Matcher", "match.matcher.Pair"),
+    "Following": ("match.track.Tracker", "match.track.Track"),
     "Answers": ("match.match.Match", "match.match.Best", "match.describe.describe_answer"),
     "Baselines and features of others": ("match.baselines.FeatureMatcher", "match.baselines.BaselineMatcher"),
     "Folding by a demonstration": ("fold.demonstration.read_demonstration", "fold.moves.answer_picture"),
-    "Photographs": ("measure.photographs.read_photographs", "measure.photographs.measure_photographs"),
+    "Photographs": ("measure.photographs.read_photographs", "measure.photographs.measure_photographs", "adapt"),
     "Other programs": ("extras.exporting.export_onnx", "extras.page.make_page"),
 }
 

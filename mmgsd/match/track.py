@@ -98,7 +98,7 @@ class Tracker:
         self._motion: _Motion | None = None
         if places is None:
             pair = matcher.prepare(image0, image0, mask0=mask0, mask1=mask0)
-            self._image0, self._said0, self._mask0 = pair.image0, pair.said[0], pair.mask0
+            self._image0, self._said0, self._mask0 = pair.image0, pair.outputs[0], pair.mask0
             self._points = check_pixels(xy, pair.image0.shape[1::-1])
             self._begin(pair)
         else:

@@ -189,7 +189,7 @@ def open_study(name: str, preset: str, *, run: bool = False, **options: Any) -> 
     if run:
         study.check(paths, **options)
     else:
-        by = f"{study.notebook} with run=True" if study.notebook else f"python -m mmgsd run {name}"
+        by = f"{study.notebook} with run=True" if study.notebook else "python -m mmgsd run " + name
         check_made(paths, by, shown)
     return Experiment(study, paths, run, options, shown)
 

@@ -28,7 +28,7 @@ from pathlib import Path
 from mmgsd.learn import training
 from mmgsd.config import TrainConfig, from_dict
 
-training._Run.finish = lambda run, weights: run.save()  # the optimiser's moments stay
+training.Run.finish = lambda run, weights: run.save()  # the optimiser's moments stay
 config = from_dict(TrainConfig, json.loads(sys.argv[1]))
 training.train_model(config, Path(sys.argv[2]), Path(sys.argv[3]), device="cpu", progress=False)
 """

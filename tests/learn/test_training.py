@@ -171,15 +171,15 @@ def test_a_failing_calibration_costs_no_training(
     with pytest.raises(RuntimeError, match="no calibration"):
         train(ONE_STEP, cloth_dataset, tmp_path / "model")
     monkeypatch.undo()
-    monkeypatch.setattr(training._Run, "advance", fail)  # all steps are done
+    monkeypatch.setattr(training.Run, "advance", fail)  # all steps are done
     assert train(ONE_STEP, cloth_dataset, tmp_path / "model").is_file()
 
 
 def test_stopping_says_what_is_kept(cloth_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def stop(run: training._Run) -> float:
+    def stop(run: training.Run) -> float:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(training._Run, "learn", lambda run, group: stop(run))
+    monkeypatch.setattr(training.Run, "learn", lambda run, group: stop(run))
     with pytest.raises(KeyboardInterrupt, match="stopped after step 0; nothing is kept yet"):
         train(TINY, cloth_dataset, tmp_path / "model")
 
@@ -200,13 +200,13 @@ def test_dense_supervision_goes_on_from_the_places_of_trained_weights(cloth_data
     config = dataclasses.replace(ONE_STEP, trunk_weights="first", learning_rate=1e-9)
     kept = {}
 
-    class Kept(training._Run):
+    class Kept(training.Run):
         def finish(self, weights: Path) -> Path:
             kept["prototypes"] = self.prototypes.detach()
             return super().finish(weights)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(training, "_Run", Kept)
+        patch.setattr(training, "Run", Kept)
         train(config, cloth_dataset, tmp_path / "second")
     places = load_file(first)[PLACES]
     assert places.shape == (625, 8)
@@ -257,7 +257,7 @@ def test_a_checkpoint_of_another_configuration(
     cloth_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(training, "CHECKPOINT_SECONDS", 0)
-    monkeypatch.setattr(training._Run, "finish", lambda run, weights: weights)  # as if killed just before
+    monkeypatch.setattr(training.Run, "finish", lambda run, weights: weights)  # as if killed just before
     train(ONE_STEP, cloth_dataset, tmp_path)
     with pytest.raises(ValueError, match="checkpoint.safetensors belongs to another configuration: .*overwrite=True"):
         train(dataclasses.replace(ONE_STEP, seed=1), cloth_dataset, tmp_path)

@@ -176,9 +176,8 @@ def test_a_damaged_table_is_asked_again(cloth_dataset: Path, tmp_path: Path) -> 
 def test_other_weights_are_asked_again(ask_oracle: object, cloth_dataset: Path, tmp_path: Path) -> None:
     out = tmp_path / "oracle.parquet"
     ask_oracle()
-    kept = evaluation._is_answered(out, load_queries(out).attrs)
     other = evaluation._describe_question(load_dataset(cloth_dataset, "test"), CONFIG, "", "another digest")
-    assert kept and not evaluation._is_answered(out, other)
+    assert load_queries(out).attrs not in ({}, other)
 
 
 def test_corrected_labels_are_asked_again(cloth_dataset: Path) -> None:

@@ -65,7 +65,7 @@ def test_a_missing_and_a_damaged_backbone_are_named(
     monkeypatch.setattr(dinov2, "find_backbone", backbone)
     monkeypatch.setattr(dinov2, "find_shipped", lambda: tmp_path)
     device = torch.device("cpu")
-    with pytest.raises(FileNotFoundError, match=r"dinov2s\.safetensors.*mmgsd\.extras\.backbones"):
+    with pytest.raises(FileNotFoundError, match=r"dinov2s\.safetensors.*mmgsd backbone"):
         dinov2.load_backbone.__wrapped__(device)
     (tmp_path / dinov2.FILE).parent.mkdir()
     (tmp_path / dinov2.FILE).write_bytes(b"no tensors")
