@@ -104,7 +104,7 @@ def _add_commands(commands: Any, table: Mapping[str, tuple[str, str]], words: li
         if words[:1] == [name]:
             function = _load(place)
             documented = function if place.startswith("cli.") else sys.modules[function.__module__]  # with examples
-            command.description, _, command.epilog = inspect.getdoc(documented).partition("\n\n")
+            command.description, _, command.epilog = (inspect.getdoc(documented) or "").partition("\n\n")
             add_arguments(command, function)
 
 

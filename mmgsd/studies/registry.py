@@ -219,7 +219,7 @@ def make_command(name: str) -> Callable[..., None]:
         *,
         preset: Annotated[str, Option("whose models and images", choices=tuple(PRESETS))] = "quick",
         set: Annotated[list, Option("of what the study's `run` takes; may be given several times", type=read_option,
-                                    action="append", metavar="NAME=VALUE")] = (),
+                                    action="append", metavar="NAME=VALUE")] = None,
     ) -> None:  # fmt: skip
         print(run_study(name, preset, **dict(set or ())))
 

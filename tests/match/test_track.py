@@ -49,8 +49,8 @@ def follow(monkeypatch: pytest.MonkeyPatch) -> Iterator:
     """Tracks through answers instead of images."""
 
     def run(answers: list) -> Track:
-        pairs = (SimpleNamespace(image0=match.image0, image1=match.image1, said=(None,), mask0=None,
-                                 match_everywhere=lambda _, said=(match, order): said)
+        pairs = (SimpleNamespace(image0=match.image0, image1=match.image1, outputs=(None,), mask0=None,
+                                 match_everywhere=lambda _, answer=(match, order): answer)
                  for match, order in [answers[0], *answers])  # fmt: skip
         matcher = SimpleNamespace(prepare=lambda *_, **__: next(pairs), size=(200, 200))
         monkeypatch.setattr(Tracker, "_prepare", lambda *_: next(pairs))
