@@ -72,7 +72,7 @@ def test_a_new_study_is_run_from_a_shell_and_shown(
     assert "| toy | 4.0 |" in study.show("toy").data
     with pytest.raises(SystemExit):
         main(["run", "--help"])
-    assert "toy " in capsys.readouterr().out
+    assert "\n    toy" in capsys.readouterr().out
 
 
 def test_pages_report_claims_findings_and_verdict_have_a_new_study(root: Path) -> None:
