@@ -82,7 +82,7 @@ def _list_studies() -> dict[str, tuple[str, str]]:
         line = re.match(r'"""(.*?)\.?("""|\n)', text)
         if name:
             found[name[1]] = f"studies.registry.make_command:{name[1]}", line[1] if line else ""
-    return found | STUDIES
+    return STUDIES | {name: place for name, place in found.items() if name not in STUDIES}
 
 
 def make_parser(words: list[str]) -> argparse.ArgumentParser:

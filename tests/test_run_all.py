@@ -32,7 +32,7 @@ def test_a_wrong_parameter_stops_at_once(tmp_path: Path, notebook: str, name: st
 
 
 def test_the_smoke_experiment_runs_from_any_folder_draws_every_figure_and_ends_with_a_verdict(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "mmgsd.report.reproduce", "smoke"]  # runs papermill itself
+    command = [sys.executable, "-m", "mmgsd", "reproduce", "smoke"]  # runs papermill itself
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=1200)
     assert done.returncode == 0, done.stderr[-3000:]
     stages = [path.stem for path in sorted((ROOT / "notebooks").glob("0[1-7]*.ipynb"))]

@@ -123,7 +123,7 @@ def test_another_runtime_and_none_are_refused(
 
 
 @in_browser
-@pytest.mark.parametrize("reading", [ModeReadout(), ModeReadout(0.05, 1.0, 6.0), ModeReadout(0.3, 2.0, 4.0)], ids=str)
+@pytest.mark.parametrize("readout", [ModeReadout(), ModeReadout(0.05, 1.0, 6.0), ModeReadout(0.3, 2.0, 4.0)], ids=str)
 def test_the_mixture_is_the_librarys_on_200_questions(
     hollow: Path, matcher: Matcher, chromium: Any, rng: np.random.Generator, readout: ModeReadout
 ) -> None:

@@ -47,10 +47,9 @@ def test_a_round_goes_on_from_the_one_before(root: Path, monkeypatch: pytest.Mon
     assert len(stored["2"]["rmse_px"]) == rounds.VALIDATIONS
     assert stored["2"]["run"]["model"] == load(second).config.name
 
-    monkeypatch.setattr("sys.argv", ["rounds", "cloth", "--last", "2"])
     monkeypatch.setattr(rounds, "find_root", lambda: root)
     monkeypatch.setattr(rounds, "train_model", lambda *_, **__: pytest.fail("a finished round is trained again"))
-    rounds.main()
+    rounds.main("cloth", last=2)
 
 
 @pytest.mark.parametrize("number", range(1, ROUNDS + 1))
