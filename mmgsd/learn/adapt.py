@@ -15,7 +15,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -63,8 +63,9 @@ from mmgsd.progress import ProgressBar
 
 STEPS, FOLDS = 120, 3
 STOPS = 4  # numbers of steps, evenly spaced, of which the best is taken
-DRAWN, RENDERS = 4, 6  # photographs of a step, each as it is and among other things, and renders
-RATE = 1e-4  # learning rate: a tenth of the training's
+DRAWN, RENDERS = 4, 8  # photographs of a step, each as it is and among other things, and renders
+RATE = 3e-4  # learning rate: less than a third of the training's
+GROWTH = 0.1  # of the error on renders, above which a number of steps is not taken, whatever is found
 SIGMA_PX = 4.0  # std of the targets: marks by hand are no better
 SPAN = 16  # steps that the average of weights spans
 CALIBRATED = 100  # pairs of test renders that the calibration is read from
@@ -194,6 +195,18 @@ def _load_renders(kind: str, folder: Path | str | None) -> dict[str, Dataset]:
     return {split: join_datasets(*(load_dataset(place, split) for place in places)) for split in ("train", "test")}
 
 
+class Found(NamedTuple):
+    """What weights find after a number of steps that did not learn from the photographs asked about."""
+
+    rows: pd.DataFrame  # of `ask_left_out`
+    rmse_px: float  # on renders
+
+
+def _read_found(file: Path) -> Found:
+    values = read_json(file)
+    return Found(pd.DataFrame(values["rows"]), values["rmse_px"])
+
+
 @dataclass
 class _Job:
     """One call of `adapt`: its materials, and where it keeps what is done of it."""
@@ -220,7 +233,7 @@ class _Job:
             groups=1, sigma_px=SIGMA_PX, sigma_start_px=SIGMA_PX, augment=True,
         )  # fmt: skip
 
-    def measure(self) -> list[dict[int, pd.DataFrame]]:
+    def measure(self) -> list[dict[int, Found]]:
         """Of each part that is left out, what is found in it after each number of steps; [] where none is."""
         count = min(self.asked["folds"], len(self.marked))
         if count < 2:
@@ -228,20 +241,23 @@ class _Job:
         order = np.random.default_rng(self.asked["seed"]).permutation(self.marked)
         return [self._measure_part(number, sorted(part)) for number, part in enumerate(np.array_split(order, count))]
 
-    def _measure_part(self, number: int, left_out: list[int]) -> dict[int, pd.DataFrame]:
+    def _measure_part(self, number: int, left_out: list[int]) -> dict[int, Found]:
         chosen = [k for k in range(len(self.photographs)) if k not in left_out]
         folder = self.work / f"part{number}"
         sources, targets = ([self.photographs[k] for k in ks if k in self.marked] for ks in (chosen, left_out))
         if (folder / RESULT.format(self.stops[-1])).is_file():
-            return {stop: pd.DataFrame(read_json(folder / RESULT.format(stop))) for stop in self.stops}
+            return {stop: _read_found(folder / RESULT.format(stop)) for stop in self.stops}
         run, found = _Adaptation(self, chosen, folder), {}
         run.resume()
         for stop in self.stops:
             self.advance(run, stop, f"adapt, part {number + 1} left out")
             file = folder / RESULT.format(stop)
             if not file.is_file():
-                write_json(file, ask_left_out(run.make_matcher(), sources, targets).to_dict("records"), indent=None)
-            found[stop] = pd.DataFrame(read_json(file))
+                matcher = run.make_matcher()
+                rows = ask_left_out(matcher, sources, targets).to_dict("records")
+                rmse_px = measure_rmse(matcher, self.renders["test"], **QUESTIONS)
+                write_json(file, {"rows": rows, "rmse_px": rmse_px}, indent=None)
+            found[stop] = _read_found(file)
         return found
 
     def advance(self, run: _Adaptation, stop: int, name: str) -> None:
@@ -250,7 +266,7 @@ class _Job:
         for _ in bar:
             bar.set_postfix(loss=f"{run.advance():.3f}", refresh=False)
 
-    def finish(self, out: Path, source: Path, found: list[dict[int, pd.DataFrame]]) -> None:
+    def finish(self, out: Path, source: Path, found: list[dict[int, Found]]) -> None:
         """Learn from all photographs, calibrate, and write card and weights, the weights last."""
         taken = choose_stop(found) if found else self.stops[-1]
         run = _Adaptation(self, list(range(len(self.photographs))), self.work / "all")
@@ -344,20 +360,22 @@ def ask_left_out(matcher: Matcher, sources: list[Photograph], targets: list[Phot
     return pd.concat(tables, ignore_index=True)
 
 
-def choose_stop(found: Sequence[dict[int, pd.DataFrame]]) -> int:
+def choose_stop(found: Sequence[dict[int, Found]]) -> int:
     """The number of steps after which most is found at 5 % less what is spurious; the least of several.
 
-    ``found`` {steps: rows of `ask_left_out`} of each part that was left out: all photographs weigh the same.
+    ``found`` {steps: what is found} of each part that was left out: all photographs weigh the same. Numbers after which
+    the error on renders has grown by more than `GROWTH` are left out.
     """
+    errors = {stop: np.mean([part[stop].rmse_px for part in found]) for stop in found[0]}
     scores = {}
-    for stop in found[0]:
-        rows = pd.concat([part[stop] for part in found])
+    for stop in (stop for stop, error in errors.items() if error <= (1 + GROWTH) * errors[0]):
+        rows = pd.concat([part[stop].rows for part in found])
         means = rows.groupby(["by", "file"])[["found@5%", "spurious"]].mean()
         scores[stop] = float((means["found@5%"] - means["spurious"]).groupby("by").mean().mean())
     return max(scores, key=lambda stop: (scores[stop], -stop))
 
 
-def summarise_change(found: Sequence[dict[int, pd.DataFrame]]) -> dict[str, Any]:
+def summarise_change(found: Sequence[dict[int, Found]]) -> dict[str, Any]:
     """{by: {"before", "after": means and intervals, "change": its intervals}}; {} where nothing was left out.
 
     "After" is after as many steps as the other parts choose: the number is not chosen by what it is measured on.
@@ -365,8 +383,8 @@ def summarise_change(found: Sequence[dict[int, pd.DataFrame]]) -> dict[str, Any]
     if not found:
         return {}
     stops = [choose_stop([other for other in found if other is not part]) for part in found]
-    before = pd.concat([part[0] for part in found], ignore_index=True)
-    after = pd.concat([part[stop] for part, stop in zip(found, stops, strict=True)], ignore_index=True)
+    before = pd.concat([part[0].rows for part in found], ignore_index=True)
+    after = pd.concat([part[stop].rows for part, stop in zip(found, stops, strict=True)], ignore_index=True)
     change = after.assign(**{name: after[name] - before[name] for name in MEASURES})
     summary = {}
     for by in before["by"].unique():

@@ -18,7 +18,7 @@ from mmgsd.__main__ import main
 from mmgsd.config import TrainConfig
 from mmgsd.learn import adapt as adapting
 from mmgsd.learn import training
-from mmgsd.learn.adapt import choose_stop, read_adaptation, summarise_change
+from mmgsd.learn.adapt import Found, choose_stop, read_adaptation, summarise_change
 from mmgsd.learn.training import train_model
 from mmgsd.measure.photographs import mark_dataset
 from mmgsd.model.weights import PLACES
@@ -164,20 +164,25 @@ def test_the_command_prints_the_card(
     assert capsys.readouterr().out == "towels cloth None True\n"
 
 
-def list_rows(found: list[float], spurious: float = 0.0) -> pd.DataFrame:
+def list_found(found: list[float], spurious: float = 0.0, rmse_px: float = 20.0) -> Found:
     """A query by a picture of each photograph."""
     rows = {"from": "own", "file": [f"{k}.jpg" for k in range(len(found))], "found@5%": found, "found@10%": found}
-    return pd.DataFrame({**rows, "spurious": spurious, "best": 1.0, "by": "picture"})
+    return Found(pd.DataFrame({**rows, "spurious": spurious, "best": 1.0, "by": "picture"}), rmse_px)
 
 
 def test_the_best_number_of_steps_is_chosen_and_the_least_of_equal_ones() -> None:
-    assert choose_stop([{0: list_rows([0.5]), 8: list_rows([0.75]), 16: list_rows([0.75])}]) == 8
-    assert choose_stop([{0: list_rows([0.5]), 8: list_rows([0.75], spurious=0.5)}]) == 0
+    assert choose_stop([{0: list_found([0.5]), 8: list_found([0.75]), 16: list_found([0.75])}]) == 8
+    assert choose_stop([{0: list_found([0.5]), 8: list_found([0.75], spurious=0.5)}]) == 0
+
+
+def test_what_is_known_of_renders_is_not_given_up() -> None:
+    worse = {8: list_found([0.7], rmse_px=21.9), 16: list_found([1.0], rmse_px=22.1)}
+    assert choose_stop([{0: list_found([0.5]), **worse}]) == 8
 
 
 def test_the_change_is_measured_after_as_many_steps_as_the_other_parts_choose() -> None:
-    first = {0: list_rows([0.0, 0.5]), 8: list_rows([1.0, 1.0]), 16: list_rows([0.5, 0.5])}
-    second = {0: list_rows([0.25]), 8: list_rows([0.25]), 16: list_rows([0.75])}
+    first = {0: list_found([0.0, 0.5]), 8: list_found([1.0, 1.0]), 16: list_found([0.5, 0.5])}
+    second = {0: list_found([0.25]), 8: list_found([0.25]), 16: list_found([0.75])}
     found = summarise_change([first, second])["picture"]
     assert found["before"]["found@5%"] == 0.25
     assert found["after"]["found@5%"] == pytest.approx((0.5 + 0.5 + 0.25) / 3, abs=1e-4)

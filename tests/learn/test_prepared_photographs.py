@@ -131,4 +131,4 @@ def test_places_are_asked_for_where_they_are_seen() -> None:
         batch = SimpleNamespace(askable=known, inside=known, xy=xy)
         loss.append(compute_place_loss(config, target, batch, places, torch.tensor([[0, 1]]), (16, 16), 0).item())
     log_total = np.log(1 + 15 * np.exp(-9))
-    assert loss == pytest.approx([log_total, 9 + log_total], abs=1e-2)
+    assert loss == pytest.approx([log_total, 9 + log_total], abs=0.05)  # of a std of 0.01 px some lies beside the cell
