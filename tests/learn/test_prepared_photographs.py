@@ -26,7 +26,7 @@ POINTS, ORDER = GROUP.n_points, GROUP.order
 class Blind:
     """A matcher that sees the object everywhere."""
 
-    object, size, modes = "cloth", (400, 400), 4
+    object, size, num_modes = "cloth", (400, 400), 4
     config = SimpleNamespace(input_px=128)
 
     def describe(self, images: list[np.ndarray]) -> list[Outputs]:
@@ -120,7 +120,7 @@ def test_points_are_added_to_renders_and_images_taken() -> None:
 
 
 def test_places_are_asked_for_where_they_are_seen() -> None:
-    config = TrainConfig(descriptor_dim=2, queries=4, sigma_px=0.01, sigma_start_px=0.01)
+    config = TrainConfig(descriptor_dim=2, queries=4, sigma_px=0.001, sigma_start_px=0.001)
     target = torch.zeros(1, 2, 4, 4)
     target[0, 0, 0, 0] = 3.0  # cell (0, 0) is described as the first place is
     places = torch.tensor([[3.0, 0.0], [0.0, 9.0]])
