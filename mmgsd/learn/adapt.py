@@ -90,8 +90,7 @@ CARD = """# {name}
 MEASURED = """\
 Photographs: means and 95 % intervals, of each marked photograph by weights that had not learnt from it: they were left
 out in {folds} parts by turns. The weights here learnt from all of them."""
-NOT_MEASURED = """\
-What it does in photographs is not measured: that takes at least two with marks."""
+NOT_MEASURED = "What it does in photographs is not measured: no marked ones were left out, of which it takes two."
 UNCHANGED = "None of the numbers of steps found more in photographs left out: the weights are as they were."
 LABELS = {"picture": "asked by another picture", "name": "by name"}
 
@@ -226,7 +225,8 @@ class _Job:
         if self.start.places is None or len(self.start.places) != train.n_points:
             self.start.places = describe_places(self.start, train)
         self.marked = [k for k, photograph in enumerate(self.photographs) if len(photograph.xy)]
-        steps = self.asked["steps"]
+        parts, steps = min(self.asked["folds"], len(self.marked)), self.asked["steps"]
+        self.parts = parts if parts > 1 else 0
         self.stops = [round(steps * k / STOPS) for k in range(STOPS + 1)]
         self.config = dataclasses.replace(
             config, steps=steps, seed=self.asked["seed"], learning_rate=RATE, optimiser="adamw", schedule="cosine",
@@ -235,11 +235,11 @@ class _Job:
 
     def measure(self) -> list[dict[int, Found]]:
         """Of each part that is left out, what is found in it after each number of steps; [] where none is."""
-        count = min(self.asked["folds"], len(self.marked))
-        if count < 2:
+        if not self.parts:
             return []
         order = np.random.default_rng(self.asked["seed"]).permutation(self.marked)
-        return [self._measure_part(number, sorted(part)) for number, part in enumerate(np.array_split(order, count))]
+        parts = np.array_split(order, self.parts)
+        return [self._measure_part(number, sorted(part)) for number, part in enumerate(parts)]
 
     def _measure_part(self, number: int, left_out: list[int]) -> dict[int, Found]:
         chosen = [k for k in range(len(self.photographs)) if k not in left_out]
@@ -250,7 +250,7 @@ class _Job:
         run, found = _Adaptation(self, chosen, folder), {}
         run.resume()
         for stop in self.stops:
-            self.advance(run, stop, f"adapt, part {number + 1} left out")
+            self.advance(run, stop, f"adapt, without part {number + 1} of {self.parts}")
             file = folder / RESULT.format(stop)
             if not file.is_file():
                 matcher = run.make_matcher()
@@ -262,7 +262,8 @@ class _Job:
 
     def advance(self, run: _Adaptation, stop: int, name: str) -> None:
         """Take the steps that are left to ``stop``."""
-        bar = ProgressBar(range(run.step, stop), desc=name, disable=not self.progress, leave=False)
+        shown = {"initial": run.step, "total": self.stops[-1], "disable": not self.progress, "leave": False}
+        bar = ProgressBar(range(run.step, stop), desc=name, **shown)
         for _ in bar:
             bar.set_postfix(loss=f"{run.advance():.3f}", refresh=False)
 
