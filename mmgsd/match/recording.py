@@ -43,6 +43,7 @@ def recording(paths: list[Path], rate: float) -> Iterator[Record]:
         number = iter(range(2**62))
 
         def record(image: np.ndarray, tracked: Tracked) -> None:
+            """Hand a frame (H, W, 3) and its answer to every file."""
             at = next(number)
             for write in writers:
                 write(at, image, tracked)
@@ -57,6 +58,7 @@ def _write_csv(path: Path, rate: float) -> Iterator[Callable[..., None]]:
         table.writerow(COLUMNS)
 
         def write(number: int, image: np.ndarray, tracked: Tracked) -> None:
+            """A row a point."""
             for point, one in enumerate(_describe(tracked)):
                 x, y = one["xy"] or ("", "")
                 table.writerow([number, round(number / rate, 3), point, x, y, one["visible"], one["confidence"],
@@ -72,6 +74,7 @@ def _write_json(path: Path, rate: float) -> Iterator[Callable[..., None]]:
         file.write(f'{{"frames_per_second": {rate:g}, "frames": [')
 
         def write(number: int, image: np.ndarray, tracked: Tracked) -> None:
+            """A line a frame."""
             values = {"frame": number, "absent": round(tracked.absent, 3), "points": _describe(tracked)}
             file.write(("," if number else "") + "\n" + json.dumps(values))
 

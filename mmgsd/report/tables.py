@@ -33,6 +33,7 @@ def update_tables(document: Path, results: Path) -> None:
     known = list_tables()
 
     def fill(marked: re.Match[str]) -> str:
+        """What stands between two marks, made anew."""
         if marked["name"] not in known:
             raise ValueError(f"{document} marks a table {marked['name']!r}, accepted are {', '.join(known)}")
         file, make = known[marked["name"]].file, known[marked["name"]].make

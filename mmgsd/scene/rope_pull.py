@@ -74,6 +74,7 @@ class _Chain:
         self._measure_reach()
 
     def let_go(self) -> None:
+        """Hold nothing any more."""
         self.held = np.empty(0, dtype=int)
         self._measure_reach()
 

@@ -144,6 +144,7 @@ def judge_improvement(results: Results) -> Claim:
     """The distance to the contrastive baseline, neither with dense supervision; other pairs are told beside."""
 
     def gain(row: str, other: str, table: str = "rmse") -> dict[str, float | None]:
+        """By how much the error of one row is below the other's, of each object."""
         return {name: _compute_gain(get(results, table, name), row, other) for name in OBJECTS}
 
     gains = gain("mmgsd_plain", "spcl")
