@@ -1,6 +1,6 @@
 """The one place that reads and writes videos: files of OpenCV's kinds, animations, folders of images as their frames.
 
-OpenCV's wheels bring FFmpeg, so mp4, avi, mov, mkv and webm are read whatever their usual codec; GIF and animated WebP
+OpenCV's wheels bring FFmpeg: mp4, avi and webm are tried, with MPEG-4, MJPG and VP8 or VP9; GIF and animated WebP
 are Pillow's. FFmpeg in these wheels writes mp4 (MPEG-4), webm (VP8) and avi (Motion JPEG).
 """
 
