@@ -23,7 +23,8 @@ IMAGE_SIZE = {"cloth": (485, 485), "rope": (640, 480)}  # (width, height) px, pa
 DEFAULT_GROUP = {"cloth": "c4", "rope": "c2"}
 OWN_GROUP = "own"  # of any other object: what its file says
 # names of no object: a preset keeps other things in folders of these names, beside its data sets
-RESERVED = ("experiments", "models", "notebooks", "queries", "sample", *(f"{name}-broken" for name in OBJECTS),
+RESERVED = ("experiments", "models", "notebooks", "pose_range", "queries", "sample",
+            *(f"{name}-broken" for name in OBJECTS),
             *(f"{name}-{method}" for name in OBJECTS for method in METHODS))  # fmt: skip
 CONTRASTIVE_REVISION = "r2"  # of PCL's and SPCL's training, to be raised with it: no older model passes for a new one
 PASSES = {"lite0": 1, "lite0x2": 2, "lite0x2fine": 2, "dinov2s": 2}  # over the feature pyramid
