@@ -12,6 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pandas as pd
+import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
@@ -19,16 +20,16 @@ from mmgsd.dataset import Dataset
 from mmgsd.figures.style import check_filled
 from mmgsd.files import DamagedFileError, write_bytes
 from mmgsd.match.match import Match
-from mmgsd.match.matcher import Matcher
+from mmgsd.match.matcher import Matcher, read_heatmap
 from mmgsd.measure.metrics import ErrorSummary, summarise_errors
 from mmgsd.measure.shipped import PLAIN
+from mmgsd.model.network import compute_cell_centres
 
 EXAMPLE_QUALITY = 90  # of the example's images, JPEG
 TRUE = "true{}"  # the tensors of the queries' true matches: true, true1, …
 _SUMMARY = ("mean_px", "histogram")  # and asked, which all methods share
 _IMAGES = ("image0", "image1")
-_ANSWER = {name: name for name in ("modes", "weights", "covariances", "entropy", "cells")}  # field: tensor of a file
-_ANSWER |= {"outlier_mass": "outside"}
+_CELLS = "{}/cells"  # tensor of a method's heatmaps: its modes are fitted to them when they are read
 
 
 @dataclass(frozen=True)
@@ -143,12 +144,19 @@ def save_figure_data(data: FigureData, path: Path) -> Path:
         if not np.array_equal(summary.asked, asked):
             raise ValueError(f"errors[{method!r}] must answer the same queries as the other methods")
         tensors |= {f"errors/{method}/{name}": getattr(summary, name) for name in _SUMMARY}
-    tensors["xy"] = example.xy
-    for method, match in data.answers.items():
-        tensors |= {f"{method}/{n}": np.asarray(getattr(match, field), np.float32) for field, n in _ANSWER.items()}
+    tensors |= {"xy": example.xy, "n": np.isfinite(example.modes[..., 0]).sum(1)}
+    tensors |= {_CELLS.format(method): np.asarray(match.cells, np.float32) for method, match in data.answers.items()}
     note = {"methods": list(data.errors), "models": list(data.answers), "object_size_px": data.object_size_px}
     packed = save({n: np.ascontiguousarray(t) for n, t in tensors.items()}, {"figures": json.dumps(note)})
     return write_bytes(path, packed)
+
+
+def _fit_answer(images: Mapping[str, np.ndarray], xy: np.ndarray, cells: np.ndarray, n: np.ndarray) -> Match:
+    """The answer that heatmaps (S, h, w) of queries with (S,) matches give, as all methods of the tables are read."""
+    centres = compute_cell_centres(images["image1"].shape[1::-1], cells.shape[1:])
+    fit, entropy = read_heatmap(torch.from_numpy(cells), torch.from_numpy(n), centres)
+    values = {name: getattr(fit, name).numpy() for name in ("modes", "weights", "covariances", "outlier_mass")}
+    return Match(**images, xy=xy, cells=cells, entropy=entropy.numpy(), **values)
 
 
 def load_figure_data(path: Path) -> FigureData:
@@ -162,8 +170,7 @@ def load_figure_data(path: Path) -> FigureData:
         summaries = {m: [tensors[f"errors/{m}/{name}"] for name in _SUMMARY] for m in note["methods"]}
         errors = {m: ErrorSummary(tensors["asked"], *summary) for m, summary in summaries.items()}
         images = {n: cv2.cvtColor(cv2.imdecode(tensors[n], cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB) for n in _IMAGES}
-        shared = {**images, "xy": tensors["xy"]}
-        answers = {m: Match(**shared, **{field: tensors[f"{m}/{n}"] for field, n in _ANSWER.items()})
+        answers = {m: _fit_answer(images, tensors["xy"], tensors[_CELLS.format(m)], tensors["n"])
                    for m in note["models"]}  # fmt: skip
         true = [tensors[TRUE.format(k or "")] for k in range(sum(name.startswith("true") for name in tensors))]
         return FigureData(errors, float(note["object_size_px"]), answers, true)
