@@ -1,21 +1,27 @@
-"""A Dask cluster of others': its address leads to a scheduler, which has workers, or a user is told what is missing."""
+"""A Dask cluster of others', or one of processes here.
+
+The address of others' leads to a scheduler, which has workers, or a user is told what is missing.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 import sys
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from typing import Any
 
-from dask.distributed import Client, Future, Security, wait
+from dask.distributed import Client, Future, LocalCluster, Security, wait
 from distributed.comm import connect
 from tqdm.auto import tqdm
 
 PATIENCE = 30.0  # s that a scheduler has to answer, and to have a worker before it is said that there is none
 LOOK = 1.0  # s between two looks at the workers
+# nobody else is to reach scheduler, workers and their pages
+LOOPBACK = {"dashboard_address": "127.0.0.1:0", "worker_dashboard_address": "127.0.0.1:0", "silence_logs": "ERROR"}
 
 
 def open_client(scheduler: str) -> Client:
@@ -35,6 +41,26 @@ async def _greet(scheduler: str) -> None:
     """A client would wait for ever where somebody listens and says nothing."""
     comm = await connect(scheduler, timeout=PATIENCE, **Security().get_connection_args("client"))
     comm.abort()
+
+
+@contextlib.contextmanager
+def open_processes(count: int) -> Iterator[Client]:
+    """A client of ``count`` processes on this machine, which end with this one; each does a task at a time."""
+    with unchanged_environment(), LocalCluster(
+        n_workers=count, threads_per_worker=1, host="127.0.0.1", memory_limit=0, **LOOPBACK
+    ) as cluster, Client(cluster) as client:  # fmt: skip
+        yield client
+
+
+@contextlib.contextmanager
+def unchanged_environment() -> Iterator[None]:
+    """Dask sets OMP_NUM_THREADS=1 and more in this process for good: a training later on would get a single thread."""
+    before = dict(os.environ)
+    try:
+        yield
+    finally:
+        os.environ.clear()
+        os.environ.update(before)
 
 
 @contextlib.contextmanager

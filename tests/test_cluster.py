@@ -11,15 +11,14 @@ import pytest
 from dask.distributed import Client, LocalCluster
 
 from mmgsd import cluster
-from mmgsd.cluster import open_client, wait_for_each
-from mmgsd.scene.stage import _unchanged_environment
+from mmgsd.cluster import open_client, unchanged_environment, wait_for_each
 
 
 @pytest.fixture
 def theirs() -> Iterator[LocalCluster]:
     """A scheduler without workers, in this process, at an address of TCP."""
     how = {"protocol": "tcp", "host": "127.0.0.1", "dashboard_address": None, "silence_logs": "CRITICAL"}
-    with _unchanged_environment(), LocalCluster(n_workers=0, processes=False, **how) as made:
+    with unchanged_environment(), LocalCluster(n_workers=0, processes=False, **how) as made:
         yield made
 
 

@@ -27,7 +27,7 @@ from dask.distributed import Client, LocalCluster
 from dask.system import cpu_count
 
 from mmgsd.checks import read_count, read_flag
-from mmgsd.cluster import open_client, run_tasks
+from mmgsd.cluster import LOOPBACK, open_client, run_tasks, unchanged_environment
 from mmgsd.config import DEFAULT_GROUP, OBJECTS, OWN_GROUP, RenderConfig, list_later, to_dict
 from mmgsd.dataset import load_dataset
 from mmgsd.dataset_format import FORMAT, SPLITS, encode_table, find_owner, is_member
@@ -226,27 +226,14 @@ def connect(workers: int, scheduler: str) -> Iterator[Client]:
             yield client
         return
     threads = workers or cpu_count()  # they only wait for the children; affinity and quotas count
-    # nobody else is to reach scheduler and worker: both talk within this process, and their pages stay on this machine
-    local = {"dashboard_address": "127.0.0.1:0", "worker_dashboard_address": "127.0.0.1:0", "processes": False}
-    with _unchanged_environment(), LocalCluster(
-        n_workers=1, threads_per_worker=threads, silence_logs="ERROR", **local
+    with unchanged_environment(), LocalCluster(
+        n_workers=1, threads_per_worker=threads, processes=False, **LOOPBACK
     ) as cluster, Client(cluster) as client:  # fmt: skip
         try:
             yield client
         finally:
             for child in list(_children):
                 child.kill()
-
-
-@contextlib.contextmanager
-def _unchanged_environment() -> Iterator[None]:
-    """Dask sets OMP_NUM_THREADS=1 and more in this process for good: a training later on would get a single thread."""
-    before = dict(os.environ)
-    try:
-        yield
-    finally:
-        os.environ.clear()
-        os.environ.update(before)
 
 
 def _render_missing(

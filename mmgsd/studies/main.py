@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.ndimage import gaussian_filter1d
 
-from mmgsd.config import METHODS, N_POINTS, OBJECTS, load_preset
+from mmgsd.config import METHODS, N_POINTS, OBJECTS, TrainConfig, load_preset
 from mmgsd.dataset import load_dataset
 from mmgsd.figures.answers import get_aspect, plot_teaser
 from mmgsd.figures.style import (
@@ -43,7 +43,7 @@ from mmgsd.paths import Paths, find_root
 from mmgsd.studies import figure_data
 from mmgsd.studies.claims import MARGIN, Claim, get, is_at_least, list_errors, list_shares, say
 from mmgsd.studies.figure_data import FigureData, load_figure_data
-from mmgsd.studies.matrix import ALL, write_main_table
+from mmgsd.studies.matrix import ALL, run_each, write_main_table
 from mmgsd.studies.models import CHANCE_STYLES, PAPER, configure_study, get_label, get_line_style
 from mmgsd.studies.parameters import Reader, among, check_images, check_made, listed
 from mmgsd.studies.registry import ERROR_MEASURES, Finding, Results, Shown, Study
@@ -82,15 +82,14 @@ def run(
     The figures get those ``drawn`` besides the four methods, and answers about material ``points`` of one example.
     """
     config, untrained = load_preset(paths.preset), evaluation.BASELINES + evaluation.CHANCE
-    asked, models = {}, {name: configure_study(config, name, "main") for name in OBJECTS}
-    weights = {name: {m: paths.model(model) / WEIGHTS for m, model in row.items()} for name, row in models.items()}
-    for name, row in models.items():
-        there = {m: model for m, model in row.items() if m == "mmgsd" or weights[name][m].is_file()}
-        how = (paths.dataset(name), config.evaluate)
-        asked[name] = {m: evaluation.evaluate_model(weights[name][m], *how, paths.queries(model.name),
-                                                    overwrite=overwrite) for m, model in there.items()}  # fmt: skip
-        asked[name] |= {m: evaluation.evaluate_baseline(m, *how, paths.queries(f"{name}-{m}"), overwrite=overwrite)
-                        for m in untrained}  # fmt: skip
+    tasks, weights = {}, {}
+    for name in OBJECTS:
+        models = configure_study(config, name, "main")
+        weights[name] = {m: paths.model(model) / WEIGHTS for m, model in models.items()}
+        there = [m for m in models if m == "mmgsd" or weights[name][m].is_file()]
+        tasks |= {(name, m): (name, m, models.get(m)) for m in (*there, *untrained)}
+    answers = run_each(partial(_ask, paths=paths, overwrite=overwrite), tasks, desc="methods")
+    asked = {name: {m: path for (object, m), path in answers.items() if object == name} for name in OBJECTS}
     stored = write_main_table(config, paths.root)
     for name, files in asked.items():
         queries = {m: evaluation.load_queries(path) for m, path in files.items()}
@@ -101,6 +100,15 @@ def run(
         gathered = figure_data.gather_figure_data(errors, trained, data, points=points)
         figure_data.save_figure_data(figure_data.keep_stored(gathered, file, stored[name]), file)
     return paths.results / "rmse.json"
+
+
+def _ask(task: tuple[str, str, TrainConfig | None], *, paths: Paths, **how: bool) -> Path:
+    """The table of answers of an object's method, of which a trained one has a model."""
+    name, method, model = task
+    question = paths.dataset(name), load_preset(paths.preset).evaluate
+    if model is None:
+        return evaluation.evaluate_baseline(method, *question, paths.queries(f"{name}-{method}"), **how)
+    return evaluation.evaluate_model(paths.model(model) / WEIGHTS, *question, paths.queries(model.name), **how)
 
 
 def list_drawn(results: Path) -> dict[str, Path]:

@@ -12,12 +12,16 @@ Notebooks find the models and their tables of answers where they would have put 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
+
+import torch
 
 from mmgsd.checks import read_count
-from mmgsd.cluster import open_client, wait_for_each
+from mmgsd.cluster import open_client, open_processes, wait_for_each
+from mmgsd.cluster import run_tasks as run_on_workers
 from mmgsd.command import Option
 from mmgsd.config import OBJECTS, Preset, TrainConfig, load_preset
 from mmgsd.files import DamagedFileError
@@ -32,6 +36,7 @@ from mmgsd.measure.evaluation import (
     summarise,
     write_results,
 )
+from mmgsd.model.network import find_device
 from mmgsd.model.tensors import WEIGHTS, describe_run
 from mmgsd.paths import Paths, find_root
 from mmgsd.progress import ProgressBar
@@ -48,6 +53,7 @@ from mmgsd.studies.parameters import read_scheduler
 
 TABLES = ("budget", "robustness", "backbones")  # studies with a file of their own, of models under their rows' names
 ALL = "`.venv/bin/python -m mmgsd run models paper`"  # as documents say it
+PROCESSES = 4  # side by side at most: each takes a gigabyte
 VALIDATIONS = 8  # RMSE on held-out simulations, in a model's log
 
 Task = TrainConfig | tuple[str, str]  # a model to train and ask, or an object and a baseline to ask
@@ -120,12 +126,36 @@ def run_tasks(tasks: list[Task], preset: Preset, root: Path, *, scheduler: str =
         yield from (future.result() for future in wait_for_each(client, futures.values()))
 
 
-def train_and_ask(model: TrainConfig, paths: Paths, *, group: str = "", overwrite: bool = False) -> tuple[Path, Path]:
+def train_and_ask(
+    model: TrainConfig, paths: Paths, *, group: str = "", overwrite: bool = False, progress: bool = True
+) -> tuple[Path, Path]:
     """Train a model and ask it the preset's questions, unless that is done: its weights, and the table of answers."""
     data, config = paths.dataset(model.object), load_preset(paths.preset).evaluate
-    weights = train_model(model, data, paths.model(model), overwrite=overwrite)
-    how = {"group": group, "overwrite": overwrite}
+    weights = train_model(model, data, paths.model(model), overwrite=overwrite, progress=progress)
+    how = {"group": group, "overwrite": overwrite, "progress": progress}
     return weights, evaluate_model(weights, data, config, paths.queries(model.name), **how)
+
+
+def run_each(function: Callable[..., Any], tasks: Mapping[Any, Any], *, desc: str, device: str = "") -> dict[Any, Any]:
+    """{name: ``function(task, progress=…)``} of every task, as they are done; on a CPU side by side, for two processes
+    do more there than two of torch's threads.
+
+    A process each for up to `PROCESSES` tasks, which share the threads; one after another in this process where that
+    has a single thread, and on a GPU.
+    """
+    threads = torch.get_num_threads() if find_device(device).type == "cpu" else 1
+    processes = min(threads, len(tasks), PROCESSES)
+    if processes < 2:
+        bar = ProgressBar(tasks.items(), desc=desc, total=len(tasks))
+        return {name: function(task, progress=True) for name, task in bar}
+    work = partial(_work_quietly, function, threads // processes)
+    with open_processes(processes) as client, run_on_workers(client, work, tasks) as done:
+        return dict(ProgressBar(done, desc=desc, total=len(tasks)))
+
+
+def _work_quietly(function: Callable[..., Any], threads: int, task: Any) -> Any:
+    torch.set_num_threads(threads)
+    return function(task, progress=False)
 
 
 def choose_tasks(preset: Preset, *, study: str = "", seeds: int = 0, steps: int = 0) -> list[Task]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,8 @@ from mmgsd.config import OBJECTS, TrainConfig, load_preset
 from mmgsd.figures.style import COLUMN_IN, check_filled, finish_axes, styled
 from mmgsd.measure.evaluation import read_results
 from mmgsd.paths import Paths
-from mmgsd.progress import ProgressBar
 from mmgsd.studies.claims import Claim, get, is_better, say
-from mmgsd.studies.matrix import train_and_ask, write_sigma_table
+from mmgsd.studies.matrix import run_each, train_and_ask, write_sigma_table
 from mmgsd.studies.models import configure_study, get_colour, vary_sigma
 from mmgsd.studies.parameters import check_training
 from mmgsd.studies.registry import ERROR_MEASURES, Results, Shown, Study
@@ -40,8 +40,8 @@ def check(paths: Paths, *, sigmas_px: Sequence[float] = (), steps: int = 0, over
 
 def run(paths: Paths, *, sigmas_px: Sequence[float] = (), steps: int = 0, overwrite: bool = False) -> Path:
     """Train and ask each model; sigma.json, or of other ``steps`` sigma_4000.json."""
-    for model in ProgressBar(list_models(paths.preset, sigmas_px, steps=steps), desc="models"):
-        train_and_ask(model, paths, overwrite=overwrite)
+    models = {model.name: model for model in list_models(paths.preset, sigmas_px, steps=steps)}
+    run_each(partial(train_and_ask, paths=paths, overwrite=overwrite), models, desc="models")
     write_sigma_table(load_preset(paths.preset), paths.root, sigmas_px, steps=steps)
     return list_shown(paths, steps=steps)[0]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,8 @@ from mmgsd.learn.training import train_model
 from mmgsd.match.matcher import Matcher
 from mmgsd.model.tensors import WEIGHTS, describe_run
 from mmgsd.paths import Paths
-from mmgsd.progress import ProgressBar
 from mmgsd.studies.claims import get
+from mmgsd.studies.matrix import run_each
 from mmgsd.studies.models import ROWS, configure_model, configure_study, get_colour, get_label
 from mmgsd.studies.parameters import check_training
 from mmgsd.studies.registry import Experiment, Shown, Study
@@ -40,9 +41,14 @@ def check(paths: Paths, *, overwrite: bool = False, device: str = "") -> None:
 
 def run(paths: Paths, *, overwrite: bool = False, device: str = "") -> Path:
     """Train the four methods on both objects, each unless it is trained; the folder of the models."""
-    for model in ProgressBar(list_models(load_preset(paths.preset)).values(), desc="models"):
-        train_model(model, paths.dataset(model.object), paths.model(model), overwrite=overwrite, device=device)
+    models = list_models(load_preset(paths.preset)).values()
+    train = partial(_train, paths=paths, overwrite=overwrite, device=device)
+    run_each(train, {model.name: model for model in models}, desc="models", device=device)
     return paths.generated / "models"
+
+
+def _train(model: TrainConfig, *, paths: Paths, **how: Any) -> Path:
+    return train_model(model, paths.dataset(model.object), paths.model(model), **how)
 
 
 def read_costs(study: Experiment) -> pd.DataFrame:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import torch
 from dask.distributed import LocalCluster
 
 from mmgsd.__main__ import main
@@ -17,6 +19,7 @@ from mmgsd.studies import matrix
 from mmgsd.studies.matrix import (
     list_repeats,
     list_tasks,
+    run_each,
     run_tasks,
     write_seed_table,
     write_sigma_table,
@@ -208,3 +211,34 @@ def test_a_study_that_is_another_list_is_refused(words: str, capsys: pytest.Capt
     with pytest.raises(SystemExit):
         main(["run", "models", "paper", *words.split()])
     assert "--study" in capsys.readouterr().err
+
+
+def tell(task: str, *, progress: bool) -> tuple[str, bool, int, int]:
+    return task, progress, os.getpid(), torch.get_num_threads()
+
+
+@pytest.mark.parametrize(("threads", "processes"), [(1, 1), (2, 2), (6, 3)])
+def test_tasks_share_the_threads_between_processes_or_run_here_one_after_another(threads, processes):
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        told = run_each(tell, {(k,): f"task {k}" for k in range(3)}, desc="tasks")
+    finally:
+        torch.set_num_threads(before)
+    assert {name: row[0] for name, row in told.items()} == {(k,): f"task {k}" for k in range(3)}
+    assert all(row[1] == (processes == 1) and (row[2] == os.getpid()) == (processes == 1) for row in told.values())
+    assert {row[3] for row in told.values()} == {threads // processes}
+
+
+def fail(task: str, *, progress: bool) -> str:
+    raise ValueError(f"{task} must be another")
+
+
+def test_what_a_process_refuses_is_raised_here_as_it_is():
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        with pytest.raises(ValueError, match="task 0 must"):
+            run_each(fail, {0: "task 0", 1: "task 1"}, desc="tasks")
+    finally:
+        torch.set_num_threads(before)
