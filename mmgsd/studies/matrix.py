@@ -143,7 +143,7 @@ def run_each(function: Callable[..., Any], tasks: Mapping[Any, Any], *, desc: st
     A process each for up to `PROCESSES` tasks, which share the threads; one after another in this process where that
     has a single thread, and on a GPU.
     """
-    threads = torch.get_num_threads() if find_device(device).type == "cpu" else 1
+    threads = torch.get_num_threads() if find_device(device) == "cpu" else 1
     processes = min(threads, len(tasks), PROCESSES)
     if processes < 2:
         bar = ProgressBar(tasks.items(), desc=desc, total=len(tasks))

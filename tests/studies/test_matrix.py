@@ -238,7 +238,7 @@ def test_what_a_process_refuses_is_raised_here_as_it_is():
     before = torch.get_num_threads()
     torch.set_num_threads(2)
     try:
-        with pytest.raises(ValueError, match="task 0 must"):
+        with pytest.raises(ValueError, match="task . must"):
             run_each(fail, {0: "task 0", 1: "task 1"}, desc="tasks")
     finally:
         torch.set_num_threads(before)
