@@ -88,7 +88,7 @@ def run(
         weights[name] = {m: paths.model(model) / WEIGHTS for m, model in models.items()}
         there = [m for m in models if m == "mmgsd" or weights[name][m].is_file()]
         tasks |= {(name, m): (name, m, models.get(m)) for m in (*there, *untrained)}
-    answers = run_each(partial(_ask, paths=paths, overwrite=overwrite), tasks, desc="methods")
+    answers = dict(run_each(partial(_ask, paths=paths, overwrite=overwrite), tasks, desc="methods"))
     asked = {name: {m: path for (object, m), path in answers.items() if object == name} for name in OBJECTS}
     stored = write_main_table(config, paths.root)
     for name, files in asked.items():

@@ -136,21 +136,23 @@ def train_and_ask(
     return weights, evaluate_model(weights, data, config, paths.queries(model.name), **how)
 
 
-def run_each(function: Callable[..., Any], tasks: Mapping[Any, Any], *, desc: str, device: str = "") -> dict[Any, Any]:
-    """{name: ``function(task, progress=…)``} of every task, as they are done; on a CPU side by side, for two processes
-    do more there than two of torch's threads.
+def run_each(
+    function: Callable[..., Any], tasks: Mapping[Any, Any], *, desc: str, device: str = ""
+) -> Iterator[tuple[Any, Any]]:  # fmt: skip
+    """(name, ``function(task, progress=…)``) of every task, as they are done.
 
-    A process each for up to `PROCESSES` tasks, which share the threads; one after another in this process where that
-    has a single thread, and on a GPU.
+    On a CPU they run side by side, for two processes do more there than two of torch's threads: up to `PROCESSES`,
+    which share the threads. Where there is a single thread, and on a GPU, one after another in this process.
     """
     threads = torch.get_num_threads() if find_device(device) == "cpu" else 1
     processes = min(threads, len(tasks), PROCESSES)
     if processes < 2:
         bar = ProgressBar(tasks.items(), desc=desc, total=len(tasks))
-        return {name: function(task, progress=True) for name, task in bar}
+        yield from ((name, function(task, progress=True)) for name, task in bar)
+        return
     work = partial(_work_quietly, function, threads // processes)
     with open_processes(processes) as client, run_on_workers(client, work, tasks) as done:
-        return dict(ProgressBar(done, desc=desc, total=len(tasks)))
+        yield from ProgressBar(done, desc=desc, total=len(tasks))
 
 
 def _work_quietly(function: Callable[..., Any], threads: int, task: Any) -> Any:

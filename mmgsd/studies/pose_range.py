@@ -13,7 +13,8 @@ from __future__ import annotations
 
 import dataclasses
 import statistics
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ from mmgsd.paths import Paths
 from mmgsd.progress import ProgressBar
 from mmgsd.scene.stage import render_dataset
 from mmgsd.studies.claims import MARGIN, Claim, get
+from mmgsd.studies.matrix import run_each
 from mmgsd.studies.models import ROWS, Model, configure_study, get_colour, get_label, get_line_style
 from mmgsd.studies.registry import Results, Shown, Study, read_table
 from mmgsd.studies.table import Column, Table
@@ -65,29 +67,36 @@ def check(paths: Paths, *, seeds: int = SEEDS, objects: str | Sequence[str] = OB
 
 
 def run(paths: Paths, *, seeds: int = SEEDS, objects: str | Sequence[str] = OBJECTS) -> Path:
-    """Render each limit's images, train each method with ``seeds`` seeds on them, and ask; pose_range.json."""
+    """Render each limit's images, train each method with ``seeds`` seeds on them, and ask; pose_range.json.
+
+    A row that is stored of the same model is kept: neither its images nor its weights are needed again.
+    """
     file = paths.results / "pose_range.json"
-    arms, rows = [(name, limit) for name in _list_objects(objects) for limit in LIMITS_DEG], {}
+    arms = [(name, limit) for name in _list_objects(objects) for limit in LIMITS_DEG]
     for name, limit in ProgressBar(arms, desc="limits"):
-        for key, row in _measure(paths, name, limit, seeds):
-            rows = read_results(file, depth=3)  # anew each time: another process may do the other object
+        there = get(read_results(file, depth=3), name, str(limit)) or {}
+        models = {key: model for key, model in list_models(paths.preset, name, seeds).items()
+                  if get(there, key, "run", "model") != model.name}  # fmt: skip
+        folders = [render_limited(paths, name, turn) for turn in (limit, LIMITS_DEG[-1])] if models else []
+        work = partial(_measure, paths=paths, limit=limit, folders=folders)
+        for key, row in run_each(work, models, desc=f"{name} {say_limit(limit)}"):
+            rows = read_results(file, depth=3)
             rows.setdefault(name, {}).setdefault(str(limit), {})[key] = row
             write_results(rows, file)
-    save_figure(plot_limits(rows), paths.figures / "pose_range")
+    save_figure(plot_limits(read_results(file, depth=3)), paths.figures / "pose_range")
     return file
 
 
-def _measure(paths: Paths, object: str, limit: int, seeds: int) -> Iterator[tuple[str, dict[str, Any]]]:
-    """A row of each model trained within a limit: what it is asked about, and then its errors; its cost."""
-    data, questions = render_limited(paths, object, limit), load_preset(paths.preset).evaluate
-    asked = {"within": data, "any": render_limited(paths, object, LIMITS_DEG[-1])}
-    models, answers = (paths.generated / "pose_range" / kind for kind in ("models", "queries"))
-    for key, model in list_models(paths.preset, object, seeds).items():
-        name = f"{model.name}-within-{limit}"
-        weights = train_model(model, data, models / name)
-        tables = {where: evaluate_model(weights, images, questions, answers / f"{name}-{where}.parquet")
-                  for where, images in asked.items()}  # fmt: skip
-        yield key, summarise(tables) | {"run": describe_run(weights)}
+def _measure(
+    model: TrainConfig, *, paths: Paths, limit: int, folders: Sequence[Path], progress: bool
+) -> dict[str, Any]:  # fmt: skip
+    """The row of a model that is trained on the first of the ``folders`` and asked about both."""
+    name, place = f"{model.name}-within-{limit}", paths.generated / "pose_range"
+    weights = train_model(model, folders[0], place / "models" / name, progress=progress)
+    questions, queries = load_preset(paths.preset).evaluate, place / "queries"
+    tables = {where: evaluate_model(weights, images, questions, queries / f"{name}-{where}.parquet", progress=progress)
+              for where, images in zip(("within", "any"), folders, strict=True)}  # fmt: skip
+    return summarise(tables) | {"run": describe_run(weights)}
 
 
 def _list_objects(objects: str | Sequence[str]) -> list[str]:
@@ -157,9 +166,8 @@ def plot_limits(results: Results) -> Figure | None:
                          color=get_colour(method), linewidths=0)  # fmt: skip
         axis.set_xticks(list(places), [say_limit(limit) for limit in LIMITS_DEG])
         axis.set(title=name, xlabel="poses trained and asked", ylabel="RMSE (px)", ylim=(0, None))
-        finish_axes(axis)
     axes[0, 0].legend()
-    return figure
+    return finish_axes(figure)
 
 
 def find_results(folder: Path, found: Results) -> dict[str, Any]:
@@ -202,7 +210,7 @@ def _say_gap(gap: float | None) -> str:
 
 
 STUDY = Study(
-    "pose_range", 60, run, check, results=("pose_range",), derive=find_results,
+    "pose_range", 75, run, check, results=("pose_range",), derive=find_results,
     tables={"pose_range": Shown("quick/pose_range.json", describe_limits, "pose_range_table")},
     figures={"pose_range": draw}, claims=(judge_one_match,),
 )  # fmt: skip

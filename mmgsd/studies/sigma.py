@@ -41,7 +41,7 @@ def check(paths: Paths, *, sigmas_px: Sequence[float] = (), steps: int = 0, over
 def run(paths: Paths, *, sigmas_px: Sequence[float] = (), steps: int = 0, overwrite: bool = False) -> Path:
     """Train and ask each model; sigma.json, or of other ``steps`` sigma_4000.json."""
     models = {model.name: model for model in list_models(paths.preset, sigmas_px, steps=steps)}
-    run_each(partial(train_and_ask, paths=paths, overwrite=overwrite), models, desc="models")
+    dict(run_each(partial(train_and_ask, paths=paths, overwrite=overwrite), models, desc="models"))
     write_sigma_table(load_preset(paths.preset), paths.root, sigmas_px, steps=steps)
     return list_shown(paths, steps=steps)[0]
 

@@ -43,7 +43,7 @@ def run(paths: Paths, *, overwrite: bool = False, device: str = "") -> Path:
     """Train the four methods on both objects, each unless it is trained; the folder of the models."""
     models = list_models(load_preset(paths.preset)).values()
     train = partial(_train, paths=paths, overwrite=overwrite, device=device)
-    run_each(train, {model.name: model for model in models}, desc="models", device=device)
+    dict(run_each(train, {model.name: model for model in models}, desc="models", device=device))
     return paths.generated / "models"
 
 

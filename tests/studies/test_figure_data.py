@@ -122,13 +122,27 @@ def test_kept_and_read_back(gathered: FigureData, tmp_path: Path) -> None:
         for field in dataclasses.fields(ErrorSummary):
             np.testing.assert_array_equal(getattr(summary, field.name), getattr(before, field.name))
     before, after = gathered.answers["mmgsd"], back.answers["mmgsd"]
-    for field in dataclasses.fields(Match):
-        kept, given = getattr(after, field.name), getattr(before, field.name)
-        assert (kept is None) == (given is None)
-        if kept is not None:
-            most = 6 if field.name.startswith("image") else 1e-6  # pictures are stored as JPEG
-            assert np.abs(np.asarray(kept, float) - given).mean() < most
+    np.testing.assert_array_equal(after.xy, before.xy)
+    np.testing.assert_array_equal(after.cells, before.cells)
+    for name in ("image0", "image1"):  # stored as JPEG
+        assert np.abs(np.asarray(getattr(after, name), float) - getattr(before, name)).mean() < 6
     np.testing.assert_array_equal(back.true, gathered.true)
+
+
+def test_stored_heatmaps_have_as_many_modes_as_there_are_matches(gathered: FigureData, tmp_path: Path) -> None:
+    cells = np.zeros((2, 24, 24), np.float32)
+    cells[0, [4, 4, 20, 20], [4, 20, 4, 20]] = 0.25
+    cells[1, 8, 16] = 1.0
+    modes = np.zeros((2, 4, 2))
+    modes[1, 1:] = np.nan  # the second query has one match
+    answer = dataclasses.replace(gathered.answers["mmgsd"], cells=cells, modes=modes)
+    stored = dataclasses.replace(gathered, answers={"mmgsd": answer, "pcl": answer})
+    back = load_figure_data(save_figure_data(stored, tmp_path / "cloth.safetensors")).answers["pcl"]
+    cell = answer.image1.shape[0] / 24
+    corners = (np.array([[4, 4], [4, 20], [20, 4], [20, 20]]) + 0.5) * cell - 0.5
+    np.testing.assert_allclose(sorted(back.modes[0].tolist()), corners, atol=1)
+    np.testing.assert_allclose(back.modes[1, 0], [16.5 * cell - 0.5, 8.5 * cell - 0.5], atol=1)
+    assert np.isnan(back.modes[1, 1:]).all()
 
 
 def test_answers_of_another_machine_are_kept_where_questions_are_the_same(gathered: FigureData, tmp_path: Path) -> None:

@@ -222,7 +222,7 @@ def test_tasks_share_the_threads_between_processes_or_run_here_one_after_another
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
-        told = run_each(tell, {(k,): f"task {k}" for k in range(3)}, desc="tasks")
+        told = dict(run_each(tell, {(k,): f"task {k}" for k in range(3)}, desc="tasks"))
     finally:
         torch.set_num_threads(before)
     assert {name: row[0] for name, row in told.items()} == {(k,): f"task {k}" for k in range(3)}
@@ -239,6 +239,6 @@ def test_what_a_process_refuses_is_raised_here_as_it_is():
     torch.set_num_threads(2)
     try:
         with pytest.raises(ValueError, match="task . must"):
-            run_each(fail, {0: "task 0", 1: "task 1"}, desc="tasks")
+            list(run_each(fail, {0: "task 0", 1: "task 1"}, desc="tasks"))
     finally:
         torch.set_num_threads(before)
