@@ -141,8 +141,6 @@ MODELS = (
 UNTRAINED = (
     Model("sift", "SIFT", "", studies=("hand_made",), colour="#CC79A7"),
     Model("orb", "ORB", "", studies=("hand_made",), colour="#999933"),
-    Model("akaze", "AKAZE", "", studies=("hand_made",), colour="#332288"),
-    Model("daisy", "DAISY", "", studies=("hand_made",), colour="#E69F00"),
     Model("imagenet", "ImageNet features", "", studies=("hand_made",), colour="#117733"),
     Model("dinov2", "DINOv2 features", "", studies=("optional",), colour="#44AA99"),
     Model("random", "random points", "", studies=("chance",), short="Random points", colour="#9A9A9A"),

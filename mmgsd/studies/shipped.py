@@ -1,6 +1,6 @@
 """What shipped weights, and what one would pick instead, do on clean renders, on cluttered ones and on photographs.
 
-    python -m mmgsd run shipped cloth cloth-paper daisy --photographs FOLDER    -> data/results/shipped.json
+    python -m mmgsd run shipped cloth cloth-paper orb --photographs FOLDER    -> data/results/shipped.json
     python -m mmgsd run shipped cloth@1,1 --photographs FOLDER     its modes read with another power and sharpness
     python -m mmgsd run shipped robustness --photographs FOLDER    the models of that study, once they are trained
     python -m mmgsd run shipped cloth --cloth-renders FOLDER       and others' renders of a cloth

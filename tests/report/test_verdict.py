@@ -103,18 +103,18 @@ def test_the_same_results_are_equal_and_no_file_is_new(paths: Paths) -> None:
 
 
 def test_numbers_that_agree_differ_are_missing_or_new_are_told_apart(paths: Paths) -> None:
-    found = change(55.0, sift=90.0, daisy=70.0)
+    found = change(55.0, sift=90.0, orb=70.0)
     del found["uncertainty"]
     table = compare_numbers(STORED, found, paths)["agrees"]
     assert table.to_dict() == {
         ("rmse", "cloth", "mmgsd", "rmse_mean"): "agrees",
         ("rmse", "cloth", "sift", "rmse_mean"): "differs",
-        ("rmse", "cloth", "daisy", "rmse_mean"): "not run here",
+        ("rmse", "cloth", "orb", "rmse_mean"): "not run here",
         ("sigma", "cloth", "4", "rmse_mean"): "equal",
         ("uncertainty, calibrated", "cloth", "mmgsd", "spearman"): "missing",
     }
-    paths.queries("cloth-daisy").touch()
-    assert compare_numbers(STORED, found, paths)["agrees"]["rmse", "cloth", "daisy", "rmse_mean"] == "new"
+    paths.queries("cloth-orb").touch()
+    assert compare_numbers(STORED, found, paths)["agrees"]["rmse", "cloth", "orb", "rmse_mean"] == "new"
 
 
 @pytest.mark.parametrize("answers", ANSWERS)

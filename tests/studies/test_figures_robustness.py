@@ -9,7 +9,7 @@ from mmgsd.studies.robustness import plot_robustness
 ROWS = {
     "cloth": {"paper": {"rmse_mean": 20.0}, "workspace": {"rmse_mean": 30.0}, "photographs": {"found@5%": 0.6}},
     "cloth-paper": {"paper": {"rmse_mean": 26.0}, "workspace": {"rmse_mean": 90.0}},
-    "rope-daisy": {"paper": {"rmse_mean": 70.0}},
+    "rope-orb": {"paper": {"rmse_mean": 70.0}},
 }
 
 
@@ -18,7 +18,7 @@ def test_bars_are_what_was_measured() -> None:
     widths = [[round(bar.get_width(), 6) for bar in axis.patches] for axis in figure.axes]
     assert widths == [[20, 26, 70], [30, 90], [60]]
     assert [label.get_text() for label in figure.axes[0].get_yticklabels()] == [
-        "Cloth: MMGSD, shipped", "Cloth: MMGSD, clean images only", "Rope: DAISY",
+        "Cloth: MMGSD, shipped", "Cloth: MMGSD, clean images only", "Rope: ORB",
     ]  # fmt: skip
 
 

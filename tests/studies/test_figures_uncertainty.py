@@ -29,9 +29,9 @@ def get_labels(figure) -> list[str]:
 
 
 def test_risk_coverage_draws_methods_in_order_with_the_oracle():
-    figure = plot_risk_coverage(make_tables("random", "daisy", "sift", "mmgsd", "unimodal"))
+    figure = plot_risk_coverage(make_tables("random", "imagenet", "sift", "mmgsd", "unimodal"))
     assert [axis.get_title() for axis in figure.axes] == ["Cloth", "Rope"]
-    assert get_labels(figure) == ["MMGSD", "MMGSD, oracle", "Unimodal", "SIFT", "DAISY"]
+    assert get_labels(figure) == ["MMGSD", "MMGSD, oracle", "Unimodal", "SIFT", "ImageNet features"]
     line, oracle, unimodal, *others = figure.axes[0].lines
     assert len(others) == 2
     assert line.get_xdata() == pytest.approx([25, 50, 75, 100])
