@@ -14,15 +14,17 @@ from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.colors import hsv_to_rgb, rgb_to_hsv
 from matplotlib.figure import Figure
+from matplotlib.patches import ConnectionPatch
 
 from mmgsd.figures.style import (
+    COLUMN_IN,
     MARK,
     PAGE_IN,
-    check_filled,
     compute_point_colours,
     fade_image,
     finish_axes,
     make_grid,
+    mark_pixel,
     show_answer,
     show_source,
     styled,
@@ -96,16 +98,37 @@ def shrink_match(match: Match) -> Match:
 
 
 @styled
-def plot_samples(images: Sequence[np.ndarray], titles: Sequence[str] | None = None, *, columns: int = 6) -> Figure:
-    """Contact sheet of (H, W, 3) images of one size. ValueError where there are none, or not one title each."""
-    check_filled("images", images)
-    if titles is not None and len(titles) != len(images):
-        raise ValueError(f"titles must be {len(images)}, one an image, got {len(titles)}")
+def plot_teaser(matches: Mapping[str, Match]) -> Figure:
+    """A row an object, of its match's first query: the source, the matches, to which lines lead, and the heatmap."""
+    aspects = [match.image1.shape[0] / match.image1.shape[1] for match in matches.values()]
+    figure, axes = make_grid(aspects, 3, COLUMN_IN)
+    for (source, target, answer), (name, match) in zip(axes, matches.items(), strict=True):
+        source.set_ylabel(name.capitalize())
+        target.imshow(match.image1)
+        target.autoscale(False)
+        _lead_to_matches(source, target, match)
+        show_source(source, match, 0)
+        show_answer(answer, match, 0)
+    for axis, title in zip(axes[0], ("Source", "Matches", "Heatmap"), strict=True):
+        axis.set_title(title)
+    return figure
+
+
+def _lead_to_matches(source: Axes, target: Axes, match: Match) -> None:
+    for mode in match.modes[0][np.isfinite(match.modes[0]).all(-1)]:
+        ends = {"xyA": tuple(match.xy[0]), "xyB": tuple(mode), "coordsA": source.transData, "coordsB": target.transData}
+        for colour, width in (("black", 1.8), (MARK, 0.8)):
+            source.figure.add_artist(ConnectionPatch(**ends, color=colour, lw=width, zorder=2))
+        mark_pixel(target, *mode)
+
+
+@styled
+def plot_samples(images: Sequence[np.ndarray], *, columns: int = 6) -> Figure:
+    """Contact sheet of (H, W, 3) images of one size."""
     aspect = images[0].shape[0] / images[0].shape[1]
     figure, axes = make_grid([aspect] * -(-len(images) // columns), columns, PAGE_IN)
-    for axis, image, title in zip(axes.flat, images, titles or [""] * len(images), strict=False):
+    for axis, image in zip(axes.flat, images, strict=False):
         axis.imshow(image)
-        axis.set_title(title)
     for axis in axes.flat[len(images) :]:
         axis.remove()
     return figure
@@ -117,10 +140,8 @@ def plot_labels(
 ) -> Figure:
     """Image, and its material points ``xy`` (P, 2) px coloured by place on the object, hidden ones hollow.
 
-    The points of an ``orbit`` are ringed on both. ValueError where ``visible`` is not (P,).
+    The points of an ``orbit`` are ringed on both.
     """
-    if xy.ndim != 2 or visible.shape != xy.shape[:1] or not len(xy):
-        raise ValueError(f"xy must be (P, 2) and visible (P,), P > 0, got {xy.shape} and {visible.shape}")
     figure, axes = make_grid([image.shape[0] / image.shape[1]], 2, PAGE_IN * 0.7)
     colours = compute_point_colours(object, len(xy))
     axes[0, 0].imshow(image)
@@ -139,7 +160,6 @@ def plot_labels(
 @styled
 def plot_orbits(image: np.ndarray, xy: np.ndarray, groups: Mapping[str, Sequence[Sequence[int]]]) -> Figure:
     """A panel a symmetry group ({name: orbits, each of indices into ``xy`` (P, 2) px}), an orbit a colour."""
-    check_filled("groups", groups)
     figure, axes = make_grid([image.shape[0] / image.shape[1]], len(groups), PAGE_IN)
     for axis, (name, orbits) in zip(axes[0], groups.items(), strict=True):
         axis.imshow(fade_image(image))
@@ -156,7 +176,6 @@ def plot_variety(tables: Mapping[str, pd.DataFrame], modes: Mapping[str, Mapping
 
     ``tables`` {object: `mmgsd.dataset.measure_images`}, ``modes`` {object: {group: (P,) modes of each point}}.
     """
-    check_filled("tables", tables)
     figure, axes = plt.subplots(len(tables), 4, figsize=(PAGE_IN, 1.6 * len(tables)), layout="constrained",
                                 squeeze=False)  # fmt: skip
     for line, (name, table) in zip(axes, tables.items(), strict=True):

@@ -22,7 +22,6 @@ from mmgsd.figures.style import (
     PAGE_IN,
     TRUE,
     blend_heatmap,
-    check_filled,
     draw_modes,
     finish_axes,
     make_grid,
@@ -184,7 +183,6 @@ def plot_error_analysis(tables: Mapping[str, pd.DataFrame]) -> Figure:
 
     In brackets where fewer than ``FEW_PAIRS`` pairs of images have these states.
     """
-    check_filled("tables", tables)
     figure, axes = plt.subplots(len(tables), 1 + len(QUESTIONS), figsize=(PAGE_IN, 2.1 * len(tables)), squeeze=False,
                                 layout="constrained", width_ratios=[1.5] + [1] * len(QUESTIONS))  # fmt: skip
     for line, (name, table) in zip(axes, tables.items(), strict=True):
@@ -250,7 +248,6 @@ def plot_worst(matches: Sequence[Match], true: Sequence[np.ndarray], errors_px: 
 
     A legend says what the signs are.
     """
-    check_filled("matches", matches)
     columns, sheet = 4, [np.hstack([m.image0, m.image1]) for m in matches]
     aspect = sheet[0].shape[0] / sheet[0].shape[1]
     figure, axes = make_grid([aspect] * -(-len(matches) // columns), columns, PAGE_IN)

@@ -18,14 +18,13 @@ from scipy.ndimage import gaussian_filter1d
 
 from mmgsd.config import METHODS, N_POINTS, OBJECTS, load_preset
 from mmgsd.dataset import load_dataset
-from mmgsd.figures.answers import get_aspect, plot_teaser
+from mmgsd.figures.plots import plot_teaser
 from mmgsd.figures.style import (
     COLUMN_IN,
     MARK,
     PAGE_IN,
     add_legend,
     blend_heatmap,
-    check_filled,
     finish_axes,
     make_grid,
     mark_true,
@@ -190,7 +189,7 @@ def count_findings(results: Results) -> dict[str, str]:
 def draw_teaser(results: Path) -> Figure:
     """A pair of the sample that needs no explanation, as the shipped weights answer it, whatever the results."""
     root = find_root()
-    return plot_teaser({name: [figure_data.ask_plain(load_shipped(name), load_sample(root, name))] for name in OBJECTS})
+    return plot_teaser({name: figure_data.ask_plain(load_shipped(name), load_sample(root, name)) for name in OBJECTS})
 
 
 def compare_answers(drawn: Mapping[str, FigureData]) -> tuple[dict[str, dict[str, Match]], dict[str, np.ndarray]]:
@@ -225,8 +224,6 @@ def plot_rmse_pdf(errors: Mapping[str, Mapping[str, ErrorSummary]], object_sizes
     ``errors`` {object: {method: summary}}, a panel an object, a line a method, chance dashed. The object's size is the
     diagonal of its bounding box, mean over the test images (``compute_object_size``). Smoothed with a std of 1 %.
     """
-    for name, methods in {"": errors, **errors}.items():
-        check_filled(f"errors[{name!r}]" if name else "errors", methods)
     figure, axes = plt.subplots(len(errors), 1, figsize=(COLUMN_IN, 0.4 + 1.4 * len(errors)), layout="constrained",
                                 sharex=True, squeeze=False)  # fmt: skip
     far = 0.0
@@ -252,8 +249,6 @@ def plot_spatial_rmse(
     ``errors`` {"rope", "cloth": {method: summary}}; each map, of the ``mapped`` that are in it, has a scale of its own,
     so that a lesser error's map is not flat; points never asked stay grey.
     """
-    for name in ("rope", "cloth"):
-        check_filled(f"errors[{name!r}]", errors.get(name, {}))
     mapped = [method for method in mapped if method in errors["cloth"]]
     figure, axes = plt.subplots(1, 1 + len(mapped), figsize=(PAGE_IN, 2.1), layout="constrained",
                                 width_ratios=[1.8] + [1.0] * len(mapped))  # fmt: skip
@@ -283,11 +278,8 @@ def plot_combined(
     trained; ``true`` {object: (n, 2) px}, crosses, and in B Gaussians of ``sigma_px``, wide enough to be seen;
     ``inwards`` {object: match of four queries, extremity first}. Modes are rings with their 1-std ellipses.
     """
-    check_filled("answers", answers)
-    for name, match in inwards.items():
-        if len(match.xy) != 4:
-            raise ValueError(f"inwards[{name!r}] must hold 4 queries, got {len(match.xy)}")
-    aspects = [get_aspect(m["mmgsd"]) for m in answers.values()] + [get_aspect(m) for m in inwards.values()]
+    shown = [*(methods["mmgsd"] for methods in answers.values()), *inwards.values()]
+    aspects = [match.image1.shape[0] / match.image1.shape[1] for match in shown]
     figure, axes = make_grid(aspects, 5, PAGE_IN)
     for line, (name, methods) in zip(axes, answers.items(), strict=False):
         _draw_comparison(line, methods, true[name], sigma_px)
@@ -330,9 +322,8 @@ def _draw_inwards(line: Sequence[Axes], match: Match) -> None:
 def compute_density(histogram: np.ndarray, step: float, *, bandwidth: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     """Centres (K,) and density (K,) of a histogram of values ≥ 0 in bins of width ``step``.
 
-    It is smoothed by a Gaussian, mirrored at zero. ValueError where the histogram counts nothing.
+    It is smoothed by a Gaussian, mirrored at zero.
     """
-    check_filled("histogram", histogram[histogram > 0])
     padded = np.pad(histogram, (0, int(np.ceil(5 * bandwidth / step))))
     density = gaussian_filter1d(padded / (padded.sum() * step), bandwidth / step, mode="reflect")
     return (np.arange(len(padded)) + 0.5) * step, density

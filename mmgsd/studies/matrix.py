@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated
 
-from mmgsd.checks import read_count
 from mmgsd.cluster import open_client, wait_for_each
 from mmgsd.command import Option
 from mmgsd.config import OBJECTS, Preset, TrainConfig, load_preset
@@ -35,15 +34,8 @@ from mmgsd.measure.evaluation import (
 from mmgsd.model.tensors import WEIGHTS, describe_run
 from mmgsd.paths import Paths, find_root
 from mmgsd.progress import ProgressBar
-from mmgsd.studies.models import (
-    RUN,
-    STUDIES,
-    configure_study,
-    list_rows,
-    list_runs,
-    vary_seed,
-    vary_sigma,
-)
+from mmgsd.studies.claims import get
+from mmgsd.studies.models import RUN, STUDIES, configure_study, list_rows, list_runs, vary_seed, vary_sigma
 from mmgsd.studies.parameters import read_scheduler
 
 TABLES = ("budget", "robustness", "backbones")  # studies with a file of their own, of models under their rows' names
@@ -150,10 +142,8 @@ def run_matrix(
     done = run_tasks(tasks, preset, root, scheduler=scheduler)
     for name, rmse in ProgressBar(done, total=len(tasks), desc="models and baselines"):
         ProgressBar.write(f"{name}: {rmse:.1f} px")
-        if seeds:
-            write_seed_table(preset, root, seeds, steps=steps)
-        elif steps:
-            write_study_table(preset, root, study, steps=steps)
+        if seeds or steps:
+            write_study_table(preset, root, "seeds" if seeds else study, values=range(seeds), steps=steps)
         else:
             write_tables(preset, root)
     kind = "seeds" if seeds else study
@@ -166,18 +156,44 @@ def write_tables(preset: Preset, root: Path) -> None:
     Where the answers are not here, given on another machine, the row that is there is kept if it is of the same model.
     """
     write_main_table(preset, root)
-    for study in TABLES:
+    for study in (*TABLES, "sigma"):
         write_study_table(preset, root, study)
-    write_sigma_table(preset, root)
 
 
-def write_study_table(preset: Preset, root: Path, study: str, *, steps: int = 0) -> None:
-    """Write the table of a study of `TABLES`, by the rule of `write_tables`.
+def write_study_table(
+    preset: Preset, root: Path, study: str, *, values: Sequence[float] = (), steps: int = 0
+) -> None:  # fmt: skip
+    """Write {object: {row: errors, and under "run" the cost}} of a study where any is done, as `write_tables` does.
 
-    The models of other ``steps`` than the study's have a file of their own: robustness_300.json.
+    ``values`` are σ (px), besides the preset's, or seeds, besides those that are there. The models of other ``steps``
+    than the study's have a file of their own: robustness_300.json. Of those compared by seeds that the study of the
+    smaller budget has as well, its rows are taken where there are no others.
     """
-    models = {name: configure_study(preset, name, study, steps=steps) for name in OBJECTS}
-    _write_study(models, Paths(root, preset.name), f"{study}_{steps}" if steps else study)
+    paths, file = Paths(root, preset.name), f"{study}_{steps}.json" if steps else f"{study}.json"
+    stored, rows, varied = read_results(paths.results / file, depth=2), {}, None
+    if study == "sigma":
+        varied = vary_sigma([*preset.sigmas_px, *values, *_read_keys(paths.results / file, stored, float)])
+    elif study == "seeds":
+        there = _read_keys(paths.results / file, stored, lambda key: int(key.rpartition("-")[2]))
+        varied = vary_seed([*values, *there])
+    others = read_results(paths.results / "budget.json", depth=2) if study == "seeds" else {}
+    named = {row["run"].get("model"): row for shared in others.values() for row in shared.values() if "run" in row}
+    for name in OBJECTS:
+        for key, model in configure_study(preset, name, study, varied, steps=steps).items():
+            kept = get(stored, name, key) or named.get(model.name, {})
+            row, run = _find_row(paths, "", model, kept, kept.get("run", {}))
+            if row:
+                rows.setdefault(name, {})[key] = {**row, "run": run}
+    if rows or stored:
+        write_results(rows, paths.results / file)
+
+
+def _read_keys(path: Path, stored: dict[str, dict], convert: Callable[[str], float]) -> list[float]:
+    """The numbers that a study's rows are called by; DamagedFileError where one is none."""
+    try:
+        return [convert(key) for rows in stored.values() for key in rows]
+    except ValueError as error:
+        raise DamagedFileError(f"{path} has a row of another study ({error}): restore it, or remove the row") from error
 
 
 def write_main_table(preset: Preset, root: Path) -> dict[str, dict[str, dict]]:
@@ -195,60 +211,6 @@ def write_main_table(preset: Preset, root: Path) -> dict[str, dict[str, dict]]:
     write_results(runs, paths.results / "runs.json")
     write_results(tables, paths.results / "rmse.json")
     return tables
-
-
-def write_sigma_table(preset: Preset, root: Path, sigmas_px: Sequence[float] = (), *, steps: int = 0) -> None:
-    """Write sigma.json, by the rule of `write_tables`; ``sigmas_px`` besides the preset's and those that are there.
-
-    The models of other ``steps`` than the smaller budget's have a file of their own: sigma_4000.json.
-    """
-    steps = read_count("steps", steps)
-    paths, study = Paths(root, preset.name), f"sigma_{steps}" if steps else "sigma"
-    there = _read_keys(paths.results / f"{study}.json", float)
-    rows = vary_sigma([*preset.sigmas_px, *sigmas_px, *there])
-    _write_study({name: configure_study(preset, name, "sigma", rows, steps=steps) for name in OBJECTS}, paths, study)
-
-
-def write_seed_table(preset: Preset, root: Path, seeds: int = 0, *, steps: int = 0) -> None:
-    """Write seeds.json, by the rule of `write_tables`: of the seeds 0 to ``seeds`` - 1, and those that are there.
-
-    The models of other ``steps`` than the main table's have a file of their own: seeds_1000.json. Of those that the
-    study of the smaller budget has as well, its rows are taken where there are no others.
-    """
-    seeds, steps = read_count("seeds", seeds), read_count("steps", steps)
-    paths, study = Paths(root, preset.name), f"seeds_{steps}" if steps else "seeds"
-    there = _read_keys(paths.results / f"{study}.json", lambda key: int(key.rpartition("-")[2]))
-    rows = vary_seed([*range(seeds), *there])
-    models = {name: configure_study(preset, name, "seeds", rows, steps=steps) for name in OBJECTS}
-    _write_study(models, paths, study, beside="budget")
-
-
-def _read_keys(path: Path, convert: Callable[[str], float]) -> list[float]:
-    """The numbers that a study's rows are called by; DamagedFileError where one is none."""
-    try:
-        return [convert(key) for rows in read_results(path, depth=2).values() for key in rows]
-    except ValueError as error:
-        if isinstance(error, DamagedFileError):
-            raise
-        raise DamagedFileError(f"{path} has a row of another study ({error}): restore it, or remove the row") from error
-
-
-def _write_study(models: dict[str, dict[str, TrainConfig]], paths: Paths, study: str, *, beside: str = "") -> None:
-    """One file {object: {key: errors, and under "run" the cost}} of models under the same keys, where any is done.
-
-    A model's row that this file lacks is that of the same model in the file ``beside``.
-    """
-    stored, rows = read_results(paths.results / f"{study}.json", depth=2), {}
-    others = read_results(paths.results / f"{beside}.json", depth=2) if beside else {}
-    named = {row["run"].get("model"): row for shared in others.values() for row in shared.values() if "run" in row}
-    for name, keyed in models.items():
-        for key, model in keyed.items():
-            kept = stored.get(name, {}).get(key) or named.get(model.name, {})
-            row, run = _find_row(paths, "", model, kept, kept.get("run", {}))
-            if row:
-                rows.setdefault(name, {})[key] = {**row, "run": run}
-    if rows or stored:
-        write_results(rows, paths.results / f"{study}.json")
 
 
 def _find_row(paths: Paths, key: str, model: TrainConfig | None, row: dict, run: dict) -> tuple[dict, dict]:

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mmgsd.config import OBJECTS, load_preset
-from mmgsd.figures.style import PAGE_IN, check_filled, finish_axes, styled
+from mmgsd.figures.style import PAGE_IN, finish_axes, styled
 from mmgsd.match.baselines import BASELINES, OPTIONAL
 from mmgsd.studies.matrix import run_matrix
 from mmgsd.studies.models import get_colour, get_label, list_rows
@@ -46,11 +46,7 @@ def make_budget_sentence(rows: Rows) -> str:
 
 @styled
 def plot_robustness(rows: Rows) -> Figure:
-    """A panel for clean renders, cluttered ones and photographs: a bar for each model and baseline of each object.
-
-    ``rows`` as `mmgsd.studies.shipped` stores them; what was not measured says so. ValueError of no row.
-    """
-    check_filled("rows", rows)
+    """A panel for clean renders, cluttered ones and photographs: a bar for each model and baseline of each object."""
     names = [name for object in OBJECTS for name in list_names(rows, object)]
     size = PAGE_IN, 0.5 + 0.17 * len(names)
     figure, axes = plt.subplots(1, len(PANELS), figsize=size, layout="constrained", sharey=True)

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from scipy.stats import spearmanr
 
 from mmgsd.config import TrainConfig, load_preset
-from mmgsd.figures.style import PAGE_IN, check_filled, finish_axes, name_grid, save_figure, styled
+from mmgsd.figures.style import PAGE_IN, finish_axes, name_grid, save_figure, styled
 from mmgsd.measure.evaluation import load_queries, read_results, summarise, write_results
 from mmgsd.measure.regions import MAP, SIDE, measure_rings, summarise_places
 from mmgsd.model.tensors import describe_run
@@ -103,7 +103,6 @@ def plot_symmetry_study(places: Mapping[str, Mapping[str, Any]]) -> Figure:
 
     ``places`` {group: what `mmgsd.measure.regions.summarise_places` gives}.
     """
-    check_filled("places", places)
     ratios = [1.0] * len(places) + [1.4, 1.4]
     figure, axes = plt.subplots(1, len(ratios), figsize=(PAGE_IN, 1.9), layout="constrained", width_ratios=ratios)
     maps = [np.array(row[MAP], float).reshape(SIDE, SIDE) for row in places.values()]

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mmgsd.config import METHODS, OBJECTS, TrainConfig, load_preset
-from mmgsd.figures.style import COLUMN_IN, add_legend, check_filled, finish_axes, save_figure, styled
+from mmgsd.figures.style import COLUMN_IN, add_legend, finish_axes, save_figure, styled
 from mmgsd.match.matcher import find_weights
 from mmgsd.measure.evaluation import BASELINES, check_same_questions, evaluate_model, load_queries, write_results
 from mmgsd.measure.uncertainty import (
@@ -172,9 +172,9 @@ def plot_risk_coverage(queries: Tables) -> Figure:
     """Mean error of the queries kept against their share, least entropy first; dashed: MMGSD ordered by its errors.
 
     ``queries`` {object: {method: table}}, a panel an object, a line a method; chance, which is never certain, is left
-    out, as are queries with a hidden source. ValueError where there are none.
+    out, as are queries with a hidden source.
     """
-    figure, axes = _make_panels("queries", queries)
+    figure, axes = _make_row(len(queries))
     for axis, (name, methods) in zip(axes, queries.items(), strict=True):
         for method in _sort_methods(methods):
             seen = methods[method][methods[method].visible]
@@ -193,13 +193,10 @@ def plot_calibration(before: Tables, after: Tables) -> Figure:
     """Share of true matches inside the ellipses against the share that they promise; grey: perfectly calibrated.
 
     ``before`` (thin, dashed) and ``after`` (solid) the calibration, {object: {method: table}} of the same
-    objects; a method in one of them only has that line only. ValueError for other objects, or none.
+    objects; a method in one of them only has that line only.
     """
-    if list(before) != list(after):
-        raise ValueError(f"before and after must have the same objects, got {list(before)} and {list(after)}")
-    figure, axes = _make_panels("before", before)
+    figure, axes = _make_row(len(before))
     for axis, name in zip(axes, before, strict=True):
-        check_filled(f"after[{name!r}]", after[name])
         _draw_diagonal(axis, name, "Expected coverage (%)")
         for method in _sort_methods(after[name]):
             _draw_coverage(axis, after[name][method], get_line_style(method))
@@ -217,11 +214,8 @@ def plot_reliability(before: Mapping[str, pd.DataFrame], after: Mapping[str, pd.
     """Reliability diagram: how often a match is near a mode, against the confidence that it is; grey: calibrated.
 
     ``before`` (rings) and ``after`` (dots with 95 % intervals) the calibration, {object: rows} of the same objects by
-    `mmgsd.measure.uncertainty.compute_reliability`. ValueError for other objects, or none.
+    `mmgsd.measure.uncertainty.compute_reliability`.
     """
-    check_filled("before", before)
-    if list(before) != list(after):
-        raise ValueError(f"before and after must have the same objects, got {list(before)} and {list(after)}")
     figure, axes = _make_row(len(before))
     style = get_line_style("mmgsd")
     for axis, name in zip(axes, before, strict=True):
@@ -241,14 +235,6 @@ def _draw_diagonal(axis: Axes, name: str, promised: str) -> None:
     axis.plot([0, 100], [0, 100], color="0.75", lw=0.8, zorder=1)
     axis.set(title=name.capitalize(), xlabel=promised, xlim=(0, 100), ylim=(0, 100), aspect="equal",
              xticks=range(0, 101, 25), yticks=range(0, 101, 25))  # fmt: skip
-
-
-def _make_panels(name: str, tables: Tables) -> tuple[Figure, np.ndarray]:
-    """A row of axes, one an object; ValueError where there is no object, or one without methods."""
-    check_filled(name, tables)
-    for key, methods in tables.items():
-        check_filled(f"{name}[{key!r}]", methods)
-    return _make_row(len(tables))
 
 
 def _make_row(count: int) -> tuple[Figure, np.ndarray]:

@@ -98,11 +98,6 @@ def test_states_of_enough_pairs_have_no_brackets_and_absent_ones_no_number(data:
     assert [text.get_text() for text in texts] == ["0", "(0)"]
 
 
-def test_nothing_to_draw_is_refused() -> None:
-    with pytest.raises(ValueError, match="tables must not be empty"):
-        plot_error_analysis({})
-
-
 class Told:
     """Stands for a matcher: what it was asked, and one mode for each match."""
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import pytest
-
 from mmgsd.studies.robustness import plot_robustness
 
 ROWS = {
@@ -33,8 +31,3 @@ def test_bars_are_of_one_reading() -> None:
 def test_errors_share_an_axis_from_zero() -> None:
     limits = [axis.get_xlim() for axis in plot_robustness(ROWS).axes]
     assert limits[0] == limits[1] and limits[0][0] == 0 and limits[0][1] > 90 and limits[2] == (0, 100)
-
-
-def test_no_row_is_refused() -> None:
-    with pytest.raises(ValueError, match="rows"):
-        plot_robustness({})

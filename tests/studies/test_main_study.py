@@ -51,11 +51,6 @@ def test_plot_combined_says_what_is_not_trained():
     assert [text.get_text() for text in figure.axes[1].texts] == ["not trained"]
 
 
-def test_plot_combined_wants_four_queries_inwards():
-    with pytest.raises(ValueError, match="must hold 4 queries, got 3"):
-        main.plot_combined({"rope": {"mmgsd": make_match()}}, {}, {"rope": make_match(3)})
-
-
 def test_compute_density_is_one_in_all_and_highest_at_the_data():
     centres, density = main.compute_density(np.bincount([48] * 100), 0.25)
     assert density.sum() * 0.25 == pytest.approx(1, abs=1e-3)
@@ -126,18 +121,3 @@ def test_compute_object_size_is_the_mean_diagonal():
     mask = np.zeros((20, 20), bool)
     mask[2:5, 3:7] = True  # 3 x 4 px
     assert figure_data.compute_object_size([mask, mask]) == pytest.approx(5)
-
-
-@pytest.mark.parametrize("call", [
-    lambda: main.plot_combined({}, {}, {}),
-    lambda: main.plot_rmse_pdf({}, {}),
-    lambda: main.plot_rmse_pdf({"cloth": {}}, {"cloth": 1.0}),
-    lambda: main.compute_density(np.zeros(3, int), 0.25),
-    lambda: main.plot_spatial_rmse({}),
-    lambda: sigma.plot_sigma_ablation({}),
-    lambda: training.plot_training({}),
-    lambda: figure_data.compute_object_size([]),
-])  # fmt: skip
-def test_empty_input_is_an_error(call):
-    with pytest.raises(ValueError, match="must not be empty"):
-        call()

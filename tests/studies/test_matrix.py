@@ -14,14 +14,7 @@ from mmgsd.__main__ import main
 from mmgsd.config import OBJECTS, Preset, load_preset
 from mmgsd.measure.evaluation import write_results
 from mmgsd.studies import matrix
-from mmgsd.studies.matrix import (
-    list_repeats,
-    list_tasks,
-    run_tasks,
-    write_seed_table,
-    write_sigma_table,
-    write_tables,
-)
+from mmgsd.studies.matrix import list_repeats, list_tasks, run_tasks, write_study_table, write_tables
 from mmgsd.studies.models import configure_model, configure_study, list_rows, list_runs, vary_seed, vary_sigma
 
 SMOKE = load_preset("smoke")
@@ -71,12 +64,12 @@ def test_errors_of_several_seeds_are_written(
     assert not (written.parent / "rmse.json").exists()
     for file in (tmp_path / "data" / "generated" / "smoke" / "queries").iterdir():  # as on another machine
         file.unlink()
-    write_seed_table(preset, tmp_path, 1, steps=1)  # seed 1 stays, though only seed 0 is asked for
+    write_study_table(preset, tmp_path, "seeds", values=[0], steps=1)  # seed 1 stays, though only seed 0 is asked for
     assert json.loads(written.read_text()) == table
     model = configure_study(preset, "rope", "seeds", vary_seed([0]), steps=1)["pcl-0"].name
     of_budget = {"rmse_mean": 3.0, "run": {"model": model}}
     write_results({"rope": {"pcl": of_budget, "spcl": {"run": {"model": "another"}}}}, written.with_name("budget.json"))
-    write_seed_table(preset, tmp_path, 1, steps=1)  # the same model is not trained twice
+    write_study_table(preset, tmp_path, "seeds", values=[0], steps=1)  # the same model is not trained twice
     assert json.loads(written.read_text()) == {**table, "rope": {"pcl-0": of_budget}}
 
 
@@ -120,8 +113,8 @@ def test_results_are_written_of_what_is_done(tiny_dataset: Callable[..., Path], 
     assert budget["cloth"]["pcl"]["rmse_mean"] == pytest.approx(of_pcl, abs=1e-3)
     assert sigma.keys() == {"cloth"} and sigma["cloth"].keys() == {"3"}
     assert sigma["cloth"]["3"]["rmse_mean"] == pytest.approx(of_sigma, abs=1e-3)
-    write_sigma_table(preset, tmp_path, [3], steps=1)  # the same models: what the smaller budget has anyway
-    write_sigma_table(preset, tmp_path, [3], steps=2)
+    write_study_table(preset, tmp_path, "sigma", values=[3], steps=1)  # the models of the smaller budget
+    write_study_table(preset, tmp_path, "sigma", values=[3], steps=2)
     assert json.loads((results / "sigma_1.json").read_text()) == sigma and not (results / "sigma_2.json").exists()
     for file in (tmp_path / "data" / "generated" / "smoke" / "queries").iterdir():  # as on another machine
         file.unlink()
@@ -197,9 +190,10 @@ def test_a_study_can_be_run_alone(study: str, names: list[str], monkeypatch: pyt
 def test_a_study_can_be_run_at_a_smaller_budget(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     chosen, written = [], []
     monkeypatch.setattr(matrix, "run_tasks", lambda tasks, *_, **__: chosen.extend(tasks) or iter([("one", 1.0)]))
-    monkeypatch.setattr(matrix, "_write_study", lambda models, paths, study: written.append(study))
+    monkeypatch.setattr(matrix, "write_results", lambda rows, path: written.append(path))
+    monkeypatch.setattr(matrix, "_find_row", lambda *_: ({"rmse_mean": 1.0}, {}))
     matrix.main("quick", study="robustness", steps=7)
-    assert [model.steps for model in chosen] == [7] * 8 and written == ["robustness_7"]
+    assert [model.steps for model in chosen] == [7] * 8 and [path.name for path in written] == ["robustness_7.json"]
     assert [model.also for model in chosen[:4]] == ["", *["workspace_quick"] * 3]
 
 
