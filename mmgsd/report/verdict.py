@@ -123,14 +123,11 @@ def judge_number(stored: float | None, found: float | None, tolerance: float) ->
 
 def measure_spreads(seeds: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> dict[tuple[str, str, str], float]:
     """{(object, method, measure): std over the seeds}, from {object: {"mmgsd-0": errors}}; none of a single seed."""
-    spreads = {}
-    for name, rows in seeds.items():
-        for method in dict.fromkeys(key.rpartition("-")[0] for key in rows):
-            each = [row for key, row in rows.items() if key.rpartition("-")[0] == method]
-            for measure in {measure.like for measure in list_measures().values()} & set(each[0]):
-                if len(each) > 1:
-                    spreads[name, method, measure] = float(np.std([row[measure] for row in each], ddof=1))
-    return spreads
+    known = {measure.like for measure in list_measures().values()}
+    rows = [(name, key.rpartition("-")[0], measure, value) for name, keyed in seeds.items()
+            for key, row in keyed.items() for measure, value in row.items() if measure in known]  # fmt: skip
+    table = pd.DataFrame(rows, columns=["object", "method", "measure", "value"]).astype({"value": float})
+    return table.groupby(["object", "method", "measure"])["value"].std().dropna().to_dict()
 
 
 def compute_tolerance(

@@ -21,16 +21,7 @@ from mmgsd.command import Option
 from mmgsd.config import OBJECTS, Preset, TrainConfig, load_preset
 from mmgsd.files import DamagedFileError
 from mmgsd.learn.training import train_model
-from mmgsd.measure.evaluation import (
-    BASELINES,
-    CHANCE,
-    evaluate_baseline,
-    evaluate_model,
-    load_queries,
-    read_results,
-    summarise,
-    write_results,
-)
+from mmgsd.measure import evaluation
 from mmgsd.model.tensors import WEIGHTS, describe_run
 from mmgsd.paths import Paths, find_root
 from mmgsd.progress import ProgressBar
@@ -43,14 +34,6 @@ ALL = "`.venv/bin/python -m mmgsd run models paper`"  # as documents say it
 VALIDATIONS = 8  # RMSE on held-out simulations, in a model's log
 
 Task = TrainConfig | tuple[str, str]  # a model to train and ask, or an object and a baseline to ask
-
-
-def list_repeats(preset: Preset, seeds: int, *, steps: int = 0) -> list[TrainConfig]:
-    """The models compared by seeds, of other ``steps`` than its where they are not 0: all with seed 0, then 1…"""
-    rows = vary_seed(range(seeds))
-    keyed = {object: configure_study(preset, object, "seeds", rows, steps=steps) for object in OBJECTS}
-    models = [keyed[object][row.name] for row in rows for object in OBJECTS]
-    return sorted(models, key=lambda model: model.seed)
 
 
 def list_tasks(preset: Preset, studies: Sequence[str] = RUN) -> list[Task]:
@@ -81,11 +64,11 @@ def run_task(
             every = max(1, model.steps // VALIDATIONS)
             weights = train_model(model, data, paths.model(model), progress=progress, validate_every=every)
         how = {"group": task.group, "progress": progress}
-        out = evaluate_model(weights, data, preset.evaluate, paths.queries(name), **how)
+        out = evaluation.evaluate_model(weights, data, preset.evaluate, paths.queries(name), **how)
     else:
         data, out = paths.dataset(task[0]), paths.queries(name)
-        evaluate_baseline(task[1], data, preset.evaluate, out, progress=progress)
-    queries = load_queries(out)
+        evaluation.evaluate_baseline(task[1], data, preset.evaluate, out, progress=progress)
+    queries = evaluation.load_queries(out)
     return name, float(queries.rmse_px[queries.visible].mean())
 
 
@@ -117,13 +100,16 @@ def train_and_ask(model: TrainConfig, paths: Paths, *, group: str = "", overwrit
     data, config = paths.dataset(model.object), load_preset(paths.preset).evaluate
     weights = train_model(model, data, paths.model(model), overwrite=overwrite)
     how = {"group": group, "overwrite": overwrite}
-    return weights, evaluate_model(weights, data, config, paths.queries(model.name), **how)
+    return weights, evaluation.evaluate_model(weights, data, config, paths.queries(model.name), **how)
 
 
 def choose_tasks(preset: Preset, *, study: str = "", seeds: int = 0, steps: int = 0) -> list[Task]:
-    """The models compared by ``seeds``; those of a ``study``, of so many ``steps`` each; or all of `RUN`."""
+    """The models compared by ``seeds``, seed after seed; those of a ``study``, of other ``steps``; or all of `RUN`."""
     if seeds:
-        return list_repeats(preset, seeds, steps=steps)
+        rows = vary_seed(range(seeds))
+        keyed = {object: configure_study(preset, object, "seeds", rows, steps=steps) for object in OBJECTS}
+        models = [keyed[object][row.name] for row in rows for object in OBJECTS]
+        return sorted(models, key=lambda model: model.seed)
     if steps:
         return [model for name in OBJECTS for model in configure_study(preset, name, study, steps=steps).values()]
     return list_tasks(preset, (study,) if study else RUN)
@@ -170,13 +156,13 @@ def write_study_table(
     smaller budget has as well, its rows are taken where there are no others.
     """
     paths, file = Paths(root, preset.name), f"{study}_{steps}.json" if steps else f"{study}.json"
-    stored, rows, varied = read_results(paths.results / file, depth=2), {}, None
+    stored, rows, varied = evaluation.read_results(paths.results / file, depth=2), {}, None
     if study == "sigma":
         varied = vary_sigma([*preset.sigmas_px, *values, *_read_keys(paths.results / file, stored, float)])
     elif study == "seeds":
         there = _read_keys(paths.results / file, stored, lambda key: int(key.rpartition("-")[2]))
         varied = vary_seed([*values, *there])
-    others = read_results(paths.results / "budget.json", depth=2) if study == "seeds" else {}
+    others = evaluation.read_results(paths.results / "budget.json", depth=2) if study == "seeds" else {}
     named = {row["run"].get("model"): row for shared in others.values() for row in shared.values() if "run" in row}
     for name in OBJECTS:
         for key, model in configure_study(preset, name, study, varied, steps=steps).items():
@@ -185,7 +171,7 @@ def write_study_table(
             if row:
                 rows.setdefault(name, {})[key] = {**row, "run": run}
     if rows or stored:
-        write_results(rows, paths.results / file)
+        evaluation.write_results(rows, paths.results / file)
 
 
 def _read_keys(path: Path, stored: dict[str, dict], convert: Callable[[str], float]) -> list[float]:
@@ -199,17 +185,18 @@ def _read_keys(path: Path, stored: dict[str, dict], convert: Callable[[str], flo
 def write_main_table(preset: Preset, root: Path) -> dict[str, dict[str, dict]]:
     """Write rmse.json and runs.json, by the rule of `write_tables`; returns the former, {object: {method: row}}."""
     paths = Paths(root, preset.name)
-    errors, costs = (read_results(paths.results / f"{name}.json", depth=n) for name, n in (("rmse", 2), ("runs", 1)))
+    errors = evaluation.read_results(paths.results / "rmse.json", depth=2)
+    costs = evaluation.read_results(paths.results / "runs.json")
     tables, runs = {name: {} for name in OBJECTS}, {}
     for name in OBJECTS:
         models = configure_study(preset, name, "main")
-        for method in (*models, *BASELINES, *CHANCE):
+        for method in (*models, *evaluation.BASELINES, *evaluation.CHANCE):
             key, stored = f"{name}-{method}", errors.get(name, {}).get(method, {})
             row, run = _find_row(paths, key, models.get(method), stored, costs.get(key, {}))
             tables[name] |= {method: row} if row else {}
             runs |= {key: run} if run else {}
-    write_results(runs, paths.results / "runs.json")
-    write_results(tables, paths.results / "rmse.json")
+    evaluation.write_results(runs, paths.results / "runs.json")
+    evaluation.write_results(tables, paths.results / "rmse.json")
     return tables
 
 
@@ -217,7 +204,7 @@ def _find_row(paths: Paths, key: str, model: TrainConfig | None, row: dict, run:
     """Results and cost of a model, or of the baseline ``key``: those of its answers, or else what is stored."""
     out = paths.queries(model.name if model else key)
     if out.is_file():
-        return summarise({key: out})[key], describe_run(paths.model(model) / WEIGHTS) if model else {}
+        return evaluation.summarise({key: out})[key], describe_run(paths.model(model) / WEIGHTS) if model else {}
     return (row, run) if model is None or run.get("model") == model.name else ({}, {})
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from mmgsd.checks import check_choice
-from mmgsd.config import OBJECTS, ROUNDS, Preset, RenderConfig, TrainConfig
+from mmgsd.config import OBJECTS, ROUNDS, Preset, TrainConfig
 
 CHANCE_STYLES = {"centre": "--", "random": ":"}
 ABOVE = {"unimodal": (0, (4, 2)), "pcl": (0, (4, 2))}  # dashed, on the lines that they lie on: MMGSD's, SPCL's
@@ -188,20 +188,12 @@ def configure_study(
     if rows is None:
         rows = vary_sigma(preset.sigmas_px) if study == "sigma" else list_rows(study)
     base = (preset.ablation if study in SMALL else preset.train)[object]
-    models = {row.name: _join_clutter(_configure(base, row), preset) for row in rows if object in row.objects}
+    models = {row.name: _configure(base, row) for row in rows if object in row.objects}
+    models = {name: dataclasses.replace(model, also=preset.cluttered) if model.also else model
+              for name, model in models.items()}  # fmt: skip
     kept = [row.name for row in rows
             if row.name in models and (row.scene or models[row.name] != models.get(row.start))]  # fmt: skip
     return {name: dataclasses.replace(models[name], steps=steps or models[name].steps) for name in kept}
-
-
-def _join_clutter(model: TrainConfig, preset: Preset) -> TrainConfig:
-    """What learns from cluttered images besides learns from those of the preset's size."""
-    return dataclasses.replace(model, also=preset.cluttered) if model.also else model
-
-
-def configure_scene(preset: Preset, object: str, row: Model) -> RenderConfig:
-    """The images of an object that a row's model is trained on."""
-    return dataclasses.replace(preset.render[object], **row.scene)
 
 
 def _configure(base: TrainConfig, row: Model) -> TrainConfig:

@@ -12,8 +12,9 @@ from scipy.signal import find_peaks
 from mmgsd.config import N_POINTS, OBJECTS
 from mmgsd.measure.metrics import BIN_PX
 from mmgsd.measure.regions import find_regions
-from mmgsd.studies import figure_data, main
+from mmgsd.studies import main
 from mmgsd.studies.claims import Claim, get, get_regions, is_better, list_errors
+from mmgsd.studies.figure_data import FigureData, load_figure_data
 from mmgsd.studies.registry import Results, Shown, Study
 from mmgsd.studies.table import Column, Table
 
@@ -24,22 +25,20 @@ COMMAND = "`04_evaluate`, `07_figures`"
 
 def measure_all(folder: Path, found: Results | None = None) -> dict[str, Any]:
     """``places``, ``peaks`` {object: `measure_places`, `count_peaks`} of a preset's data of figures, where it is."""
-    drawn = {name: path for name, path in main.list_drawn(folder).items() if path.is_file()}
-    places = {name: measure_places(path, name) for name, path in drawn.items()}
-    return {"places": places, "peaks": {n: count_peaks(path) for n, path in drawn.items()}} if drawn else {}
+    drawn = {name: load_figure_data(path) for name, path in main.list_drawn(folder).items() if path.is_file()}
+    places = {name: measure_places(data, name) for name, data in drawn.items()}
+    return {"places": places, "peaks": {name: count_peaks(data) for name, data in drawn.items()}} if drawn else {}
 
 
-def count_peaks(path: Path) -> int:
+def count_peaks(data: FigureData) -> int:
     """How many peaks the distribution of MMGSD's error has, as it is drawn (`mmgsd.studies.main.plot_rmse_pdf`)."""
-    data = figure_data.load_figure_data(path)
     _, density = main.compute_density(data.errors["mmgsd"].histogram, 100 * BIN_PX / data.object_size_px)
     return len(find_peaks(np.pad(density, 1), prominence=PEAK * density.max())[0])
 
 
-def measure_places(path: Path, name: str) -> dict[str, float]:
+def measure_places(data: FigureData, name: str) -> dict[str, float]:
     """MMGSD's mean error (px) by place on the object: ``corner``, ``edge``, ``interior``, or ``end``, ``middle``."""
-    errors = figure_data.load_figure_data(path).errors["mmgsd"]
-    from_middle = np.abs(np.arange(N_POINTS) / (N_POINTS - 1) - 0.5)
+    errors, from_middle = data.errors["mmgsd"], np.abs(np.arange(N_POINTS) / (N_POINTS - 1) - 0.5)
     along = {"end": from_middle > 0.5 - ENDS, "middle": from_middle < ENDS}
     places = find_regions() if name == "cloth" else along
     mean, asked = np.nan_to_num(errors.mean_px), errors.asked

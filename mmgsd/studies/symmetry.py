@@ -74,7 +74,8 @@ def describe_symmetry(results: Results) -> Table:
 def judge_group(results: Results) -> Claim:
     """This project's own conjecture about the paper's error map, in which the error grows inwards."""
     rings = {group: get(results, "symmetry", group, "rings") for group in ("v4", "c4")}
-    inwards = {group: None if row is None else rank_inwards(row) for group, row in rings.items()}
+    inwards = {group: None if row is None else float(spearmanr(range(len(row) - 1), row[:-1]).statistic)
+               for group, row in rings.items()}  # fmt: skip  # without the centre, which is one point
     known = None not in inwards.values()
     shown = [f"`{group}`: {say(row[0])} … {say(row[-2])} px, rank correlation {say(inwards[group], 'share')}"
              for group, row in rings.items() if row]  # fmt: skip
@@ -84,11 +85,6 @@ def judge_group(results: Results) -> Claim:
         "and not under `c4`.", f"rings, outermost … next to the centre, {'; '.join(shown) or '–'}; one seed",
         (inwards["v4"] >= RANKED > inwards["c4"] if known else None,), runs="symmetry",
     )  # fmt: skip
-
-
-def rank_inwards(rings: Sequence[float]) -> float:
-    """Rank correlation of errors by ring, outermost first, with the ring; the centre, one point, is left out."""
-    return float(spearmanr(range(len(rings) - 1), rings[:-1]).statistic)
 
 
 def draw_symmetry(folder: Path) -> Figure | None:

@@ -14,14 +14,8 @@ from matplotlib.figure import Figure
 from mmgsd.config import METHODS, OBJECTS, TrainConfig, load_preset
 from mmgsd.figures.style import COLUMN_IN, add_legend, finish_axes, save_figure, styled
 from mmgsd.match.matcher import find_weights
+from mmgsd.measure import uncertainty as measured
 from mmgsd.measure.evaluation import BASELINES, check_same_questions, evaluate_model, load_queries, write_results
-from mmgsd.measure.uncertainty import (
-    LEVELS,
-    compute_coverage,
-    compute_risk_coverage,
-    get_distances,
-    summarise_uncertainty,
-)
 from mmgsd.model.tensors import WEIGHTS, load_metadata
 from mmgsd.paths import Paths
 from mmgsd.studies.claims import NATS, RANKED, Claim, get, get_regions, is_above, is_at_least, say
@@ -84,7 +78,8 @@ def run(paths: Paths, *, classical: Sequence[str] = ("sift", "orb"), overwrite: 
               for name, methods in after.items()}  # fmt: skip
     for name, methods in tables.items():
         check_same_questions(methods | {f"{m}, uncalibrated": table for m, table in before[name].items()})
-    summary = {when: {o: {m: summarise_uncertainty(t) for m, t in methods.items()} for o, methods in asked.items()}
+    summary = {when: {name: {m: measured.summarise_uncertainty(table) for m, table in methods.items()}
+                      for name, methods in asked.items()}
                for when, asked in {"calibrated": tables, "temperature 1": before}.items()}  # fmt: skip
     file = write_results(summary, paths.results / "uncertainty.json")
     shown = {o: {m: t for m, t in ts.items() if m in (*METHODS, *classical)} for o, ts in tables.items()}
@@ -249,13 +244,14 @@ def _sort_methods(methods: Iterable[str]) -> list[str]:
 
 
 def _draw_risk(axis: Axes, error: pd.Series, score: pd.Series, style: dict) -> None:
-    coverage, risk = compute_risk_coverage(error, score)
+    coverage, risk = measured.compute_risk_coverage(error, score)
     chosen = np.unique((np.arange(1, CURVE_POINTS + 1) * len(risk) - 1) // CURVE_POINTS)  # the last always
     axis.plot(100 * coverage[chosen], risk[chosen], **style)
 
 
 def _draw_coverage(axis: Axes, queries: pd.DataFrame, style: dict) -> None:
-    axis.plot(100 * np.array(LEVELS), 100 * compute_coverage(get_distances(queries)), **style)
+    shares = measured.compute_coverage(measured.get_distances(queries))
+    axis.plot(100 * np.array(measured.LEVELS), 100 * shares, **style)
 
 
 STUDY = Study(

@@ -72,12 +72,6 @@ def test_method_without_calibration_keeps_its_name():
     assert len(figure.axes[1].lines) == 4
 
 
-def test_figures_are_saved_as_pdf_and_png(tmp_path):
-    tables = make_tables("mmgsd")
-    for figure in (plot_risk_coverage(tables), plot_calibration(tables, tables)):
-        assert [path.stat().st_size > 1000 for path in drawing.save_figure(figure, tmp_path / "figure")] == [True, True]
-
-
 def test_reliability_draws_rings_before_and_intervals_after():
     rows = pd.DataFrame({"expected": [0.1, 0.9], "observed": [0.3, 0.8], "margin": [0.1, 0.05], "count": [10, 20]})
     figure = plot_reliability({"cloth": rows, "rope": rows.iloc[:1]}, {"cloth": rows, "rope": rows})

@@ -14,7 +14,7 @@ from mmgsd.__main__ import main
 from mmgsd.config import OBJECTS, Preset, load_preset
 from mmgsd.measure.evaluation import write_results
 from mmgsd.studies import matrix
-from mmgsd.studies.matrix import list_repeats, list_tasks, run_tasks, write_study_table, write_tables
+from mmgsd.studies.matrix import choose_tasks, list_tasks, run_tasks, write_study_table, write_tables
 from mmgsd.studies.models import configure_model, configure_study, list_rows, list_runs, vary_seed, vary_sigma
 
 SMOKE = load_preset("smoke")
@@ -42,11 +42,11 @@ def test_the_models_that_matter_most_come_first() -> None:
 
 def test_seed_after_seed_the_same_models_are_repeated() -> None:
     preset = load_preset("paper")
-    models = list_repeats(preset, 3)
+    models = choose_tasks(preset, seeds=3)
     assert [m.seed for m in models] == [0] * 10 + [1] * 10 + [2] * 10
     assert models[:10] == [configure_model(preset, name, row.name) for row in list_rows("seeds") for name in OBJECTS]
     of_budget = [configure_study(preset, name, "budget")[row.name] for row in list_rows("seeds") for name in OBJECTS]
-    assert list_repeats(preset, 1, steps=1000) == of_budget
+    assert choose_tasks(preset, seeds=1, steps=1000) == of_budget
 
 
 def test_errors_of_several_seeds_are_written(
@@ -190,7 +190,7 @@ def test_a_study_can_be_run_alone(study: str, names: list[str], monkeypatch: pyt
 def test_a_study_can_be_run_at_a_smaller_budget(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     chosen, written = [], []
     monkeypatch.setattr(matrix, "run_tasks", lambda tasks, *_, **__: chosen.extend(tasks) or iter([("one", 1.0)]))
-    monkeypatch.setattr(matrix, "write_results", lambda rows, path: written.append(path))
+    monkeypatch.setattr(matrix.evaluation, "write_results", lambda rows, path: written.append(path))
     monkeypatch.setattr(matrix, "_find_row", lambda *_: ({"rmse_mean": 1.0}, {}))
     matrix.main("quick", study="robustness", steps=7)
     assert [model.steps for model in chosen] == [7] * 8 and [path.name for path in written] == ["robustness_7.json"]
