@@ -60,7 +60,8 @@ def judge_run(paths: Paths) -> Verdict:
     with told_where(paths.results):
         numbers = compare_numbers(state["results"], found, paths)
     files = compare_files(state["before"], now)
-    hardware = [list_hardware(results) for results in (state["results"], found)]
+    hardware = [sorted({run["hardware"] for run in results.get("runs", {}).values()})
+                for results in (state["results"], found)]  # fmt: skip
     summary = summarise(numbers, files, hardware=hardware, meaningless=paths.preset == "smoke", stored=state["before"])
     write_text(find_run(paths) / "verdict.txt", summary)
     write_json(_find_stored(paths), {**state, "running": False, "after": now})
@@ -146,11 +147,6 @@ def compare_files(before: Mapping[str, str], now: Mapping[str, str]) -> pd.DataF
     names = [name for name in sorted({*before, *now}) if before.get(name) != now.get(name)]
     said = ["new" if name not in before else "written anew" if name in now else "gone" for name in names]
     return pd.DataFrame({"file": said}, pd.Index(names, name="path"), dtype=object)
-
-
-def list_hardware(results: Mapping[str, Any]) -> list[str]:
-    """What the models of runs.json were trained on."""
-    return sorted({run["hardware"] for run in results.get("runs", {}).values()})
 
 
 def summarise(

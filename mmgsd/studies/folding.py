@@ -110,18 +110,15 @@ def run(
     return write_json(out, results)
 
 
-def write_demonstrations(root: Path, *, workers: int = 0, scheduler: str = "", progress: bool = True) -> list[Path]:
-    """Write what policies are shown of each task as files of the format that a user's demonstrations have; their paths.
+def write_demonstrations(root: Path, **how: Any) -> list[Path]:
+    """Write what policies are shown of each task to ``data/demonstrations``, as a user's demonstrations are; the paths.
 
-    To ``data/demonstrations``, by name of the task. ``workers`` and ``scheduler`` are as `run_jobs` has them.
+    ``how``, the workers, scheduler and progress, is as `run_jobs` has it.
     """
-    how = {"workers": workers, "scheduler": scheduler, "progress": progress}
-    bench = Bench(Paths(root, "quick").generated / "folding", how)
+    bench, folder = Bench(Paths(root, "quick").generated / "folding", how), root / "data" / "demonstrations"
     bench.demonstrate(TASKS.values())
-    folder = root / "data" / "demonstrations"
-    files = {task: folder / f"{task.name}.json" for task in TASKS.values()}
-    return [write_demonstration(bench.make_demonstration(task), file, quality=DEMONSTRATION_QUALITY)
-            for task, file in files.items()]  # fmt: skip
+    return [write_demonstration(bench.make_demonstration(task), folder / f"{task.name}.json",
+                                quality=DEMONSTRATION_QUALITY) for task in TASKS.values()]  # fmt: skip
 
 
 class Bench:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from mmgsd.config import N_POINTS, OBJECTS
 from mmgsd.measure.metrics import BIN_PX
 from mmgsd.measure.regions import find_regions
 from mmgsd.studies import main
-from mmgsd.studies.claims import Claim, get, get_regions, is_better, list_errors
+from mmgsd.studies.claims import Claim, get, get_regions, hold_all, is_better, list_errors
 from mmgsd.studies.figure_data import FigureData, load_figure_data
 from mmgsd.studies.registry import Results, Shown, Study
 from mmgsd.studies.table import Column, Table
@@ -56,19 +55,13 @@ def judge_interior(results: Results) -> Claim:
     """Where on the objects the errors lie; for the cloth, where not measured by place, the study's model of c4."""
     cloth = get(results, "places", "cloth") or get_regions(results, "c4", "rmse_px")
     rope = get(results, "places", "rope") or {}
-    parts = (_is_greatest(cloth, "interior", ("corner", "edge")), is_better(rope.get("end"), rope.get("middle")))
+    lower = [is_better(cloth.get(place), cloth.get("interior")) for place in ("corner", "edge")]
+    parts = (hold_all(lower), is_better(rope.get("end"), rope.get("middle")))
     return Claim(
         "interior", "Errors are highest in the object's interior and low at its extremities.",
         "MMGSD's error inside is larger than at corners and edges (cloth), or than at the ends (rope); a part each.",
         f"cloth: {list_errors(cloth)}; rope: {list_errors(rope)}; one seed", parts, COMMAND, ("mmgsd",),
     )  # fmt: skip
-
-
-def _is_greatest(errors: Mapping[str, float | None], place: str, others: Sequence[str]) -> bool | None:
-    lower = [is_better(errors.get(other), errors.get(place)) for other in others]
-    if False in lower:
-        return False
-    return None if None in lower else True
 
 
 def judge_bimodal(results: Results) -> Claim:

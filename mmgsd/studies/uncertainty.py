@@ -18,7 +18,7 @@ from mmgsd.measure import uncertainty as measured
 from mmgsd.measure.evaluation import BASELINES, check_same_questions, evaluate_model, load_queries, write_results
 from mmgsd.model.tensors import WEIGHTS, load_metadata
 from mmgsd.paths import Paths
-from mmgsd.studies.claims import NATS, RANKED, Claim, get, get_regions, is_above, is_at_least, say
+from mmgsd.studies.claims import NATS, RANKED, Claim, get, get_regions, hold_all, is_above, is_at_least, say
 from mmgsd.studies.models import CHANCE_STYLES, SHIPPED, configure_model, get_line_style
 from mmgsd.studies.parameters import check_images, check_made
 from mmgsd.studies.registry import Experiment, Finding, Measure, Results, Shown, Study
@@ -145,8 +145,7 @@ def judge_inward(results: Results) -> Claim:
     """Where the uncertainty lies, as the symmetry study's model of c4 has it."""
     nats = get_regions(results, "c4", "entropy")
     corner, edge, interior = (nats.get(region) for region in ("corner", "edge", "interior"))
-    above = is_above(edge, corner), is_above(interior, corner)
-    least = False if False in above else None if None in above else True
+    least = hold_all([is_above(edge, corner), is_above(interior, corner)])
     shown = ", ".join(f"{region} {say(value, 'share')}" for region, value in nats.items())
     return Claim(
         "inward", "Uncertainty is least at the extremities and grows inwards.",

@@ -237,13 +237,14 @@ def test_other_tables_have_their_numbers() -> None:
     assert rows["runs_table"]["SPCL"] == ["100", "1.5"] * 2
 
 
-def test_negative_numbers_have_a_minus() -> None:
-    assert set_text("-0.05 → -1") == r"$-$0.05\,$\to$\,$-$1" and set_text("8-15, a-b") == "8-15, a-b"
-
-
-def test_markup_and_units_are_set() -> None:
-    assert set_text("**ours**, *theirs*, `v_4`") == r"\textbf{ours}, \emph{theirs}, \texttt{v\_4}"
-    assert set_text("50 % within 20 px; σ px") == r"50\,\% within 20~px; $\sigma$ px"
+@pytest.mark.parametrize(("text", "latex"), [
+    ("-0.05 → -1", r"$-$0.05\,$\to$\,$-$1"),
+    ("8-15, a-b", "8-15, a-b"),
+    ("**ours**, *theirs*, `v_4`", r"\textbf{ours}, \emph{theirs}, \texttt{v\_4}"),
+    ("50 % within 20 px; σ px", r"50\,\% within 20~px; $\sigma$ px"),
+])  # fmt: skip
+def test_markup_units_and_signs_are_set(text: str, latex: str) -> None:
+    assert set_text(text) == latex
 
 
 def test_claims_table_prints_each_verdict() -> None:

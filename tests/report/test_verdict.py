@@ -41,6 +41,12 @@ def write_results(paths: Paths, results: dict[str, Any]) -> None:
         (paths.results / f"{name}.json").write_text(json.dumps(content))
 
 
+def touch_answers(paths: Paths) -> None:
+    for name in ANSWERS:
+        paths.queries(name).parent.mkdir(parents=True, exist_ok=True)
+        paths.queries(name).touch()
+
+
 def change(error: float, **others: float) -> dict[str, Any]:
     """What is stored, with other errors of MMGSD, and others, on the cloth."""
     results = copy.deepcopy(STORED)
@@ -54,9 +60,7 @@ def paths(tmp_path: Path) -> Paths:
     """A preset with stored results and all answers there."""
     paths = Paths(tmp_path, "quick")
     write_results(paths, STORED)
-    for name in ANSWERS:
-        paths.queries(name).parent.mkdir(parents=True, exist_ok=True)
-        paths.queries(name).touch()
+    touch_answers(paths)
     return paths
 
 
@@ -172,9 +176,7 @@ def test_without_stored_results_all_is_new(tmp_path: Path) -> None:
     paths = Paths(tmp_path, "quick")
     keep_stored(paths)
     write_results(paths, STORED)
-    for name in ANSWERS:
-        paths.queries(name).parent.mkdir(parents=True, exist_ok=True)
-        paths.queries(name).touch()
+    touch_answers(paths)
     summary = judge_run(paths).summary
     assert "0 of 0 numbers" in summary and "4 new" in summary and "mean nothing" not in summary
 

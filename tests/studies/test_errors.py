@@ -36,21 +36,17 @@ def make_queries(points: list[int]) -> pd.DataFrame:
     return table.assign(rmse_px=np.arange(len(points)) * 10.0, hidden=0)
 
 
-def test_distances_on_a_cloth_by_hand(data: Dataset) -> None:
-    data.visible[0, 12 * 25 + 14] = False  # two points right of the centre
-    described = describe_queries(make_queries([0, 30, 312]), data)
-    assert described.border.tolist() == [0, 1, 12]
-    assert described.covered.tolist() == [14, 11, 2]
-    assert described.state0.tolist() == ["state 0"] * 3
-    assert described.state1.tolist() == ["state 1"] * 3
-
-
-@pytest.mark.parametrize("data", ["rope"], indirect=True)
-def test_distances_on_a_rope_by_hand(data: Dataset) -> None:
-    data.visible[0, 100] = False
-    described = describe_queries(make_queries([0, 90, 624]), data)
-    assert described.border.tolist() == [0, 90, 0]
-    assert described.covered.tolist() == [100, 10, 524]
+@pytest.mark.parametrize(("data", "hidden", "points", "border", "covered"), [
+    ("cloth", 12 * 25 + 14, [0, 30, 312], [0, 1, 12], [14, 11, 2]),  # two points right of the centre
+    ("rope", 100, [0, 90, 624], [0, 90, 0], [100, 10, 524]),
+], indirect=["data"])  # fmt: skip
+def test_distances_by_hand(
+    data: Dataset, hidden: int, points: list[int], border: list[int], covered: list[int]
+) -> None:
+    data.visible[0, hidden] = False
+    described = describe_queries(make_queries(points), data)
+    assert described.border.tolist() == border and described.covered.tolist() == covered
+    assert set(described.state0) == {"state 0"} and set(described.state1) == {"state 1"}
 
 
 def test_hidden_sources_are_left_out(data: Dataset) -> None:

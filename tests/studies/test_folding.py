@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -28,14 +29,14 @@ POSE = np.array([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 2.5], [0, 0, 0, 1]]) 
 MATRIX = np.array([[60.0, 0, 49.5], [0, 60, 49.5], [0, 0, 1]])
 
 
-def lay(object: str, about: dict, *, moved: float = 0.0) -> State:
-    points = FLAT[object] + (moved, 0, 0)
+def lay(object: str, about: dict, *, points: np.ndarray | None = None) -> State:
+    """A state on the table, of which the middle is seen; the object lies flat unless ``points`` say otherwise."""
+    points = (FLAT[object] if points is None else points).astype(np.float32)
     mask = np.zeros((100, 100), bool)
-    mask[35:65, 35:65] = True
-    state = State(points.astype(np.float32), points.astype(np.float32), np.zeros((100, 100, 3), np.uint8), mask,
-                  np.zeros((625, 2), np.float32), np.ones(625, bool), MATRIX, POSE, FLAT[object].astype(np.float32),
-                  about)  # fmt: skip
-    return State(**{**state.__dict__, "xy": state.project(points).astype(np.float32)})
+    mask[38:62, 38:62] = True
+    state = State(points, points, np.zeros((100, 100, 3), np.uint8), mask, np.zeros((625, 2), np.float32),
+                  np.ones(625, bool), MATRIX, POSE, points, about)  # fmt: skip
+    return dataclasses.replace(state, xy=state.project(points).astype(np.float32))
 
 
 @pytest.fixture

@@ -11,13 +11,22 @@ import pytest
 from dask.distributed import LocalCluster
 
 from mmgsd.__main__ import main
-from mmgsd.config import OBJECTS, Preset, load_preset
+from mmgsd.config import OBJECTS, Preset, TrainConfig, load_preset
 from mmgsd.measure.evaluation import write_results
 from mmgsd.studies import matrix
 from mmgsd.studies.matrix import choose_tasks, list_tasks, run_tasks, write_study_table, write_tables
 from mmgsd.studies.models import configure_model, configure_study, list_rows, list_runs, vary_seed, vary_sigma
 
 SMOKE = load_preset("smoke")
+
+
+@pytest.fixture
+def chosen(monkeypatch: pytest.MonkeyPatch) -> list[TrainConfig]:
+    """What would be trained, of which one is said to be done."""
+    tasks: list[TrainConfig] = []
+    monkeypatch.setattr(matrix, "run_tasks", lambda asked, *_, **__: tasks.extend(asked) or iter([("one", 1.0)]))
+    monkeypatch.setattr(matrix, "write_tables", lambda *_: None)
+    return tasks
 
 
 def test_the_models_that_matter_most_come_first() -> None:
@@ -126,12 +135,10 @@ def test_results_are_written_of_what_is_done(tiny_dataset: Callable[..., Path], 
     assert read_results(changed, tmp_path)["cloth"].keys() == {"sift"}
 
 
-def test_some_can_be_chosen_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = []
-    monkeypatch.setattr(matrix, "run_tasks", lambda tasks, *_, **__: asked.extend(tasks) or iter(()))
+def test_some_can_be_chosen_by_name(chosen: list[TrainConfig]) -> None:
     matrix.main("paper", only="rope-spcl")
-    assert [(m.object, m.method) for m in asked] == [("rope", "spcl")] * 7
-    assert [m.steps for m in asked] == [4000, 1000, 1000, 1000, 4000, 4000, 3500]
+    assert [(m.object, m.method) for m in chosen] == [("rope", "spcl")] * 7
+    assert [m.steps for m in chosen] == [4000, 1000, 1000, 1000, 4000, 4000, 3500]
     with pytest.raises(ValueError, match="--only 'shirt'"):
         matrix.main("paper", only="shirt")
 
@@ -179,17 +186,17 @@ def test_what_a_model_starts_from_is_trained_before_it(tiny_dataset: Callable[..
 @pytest.mark.parametrize(("study", "names"), [
     ("robustness", ["mmgsd", "mmgsd_workspace", "mmgsd_clutter", "mmgsd_heads"]), ("shipped", ["shipped"]),
 ])  # fmt: skip
-def test_a_study_can_be_run_alone(study: str, names: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    chosen, paper = [], load_preset("paper")
-    monkeypatch.setattr(matrix, "run_tasks", lambda tasks, *_, **__: chosen.extend(tasks) or iter(()))
+def test_a_study_can_be_run_alone(study: str, names: list[str], chosen: list[TrainConfig]) -> None:
+    paper = load_preset("paper")
     matrix.main("paper", study=study, only="cloth")
     assert chosen == list(configure_study(paper, "cloth", study).values())
     assert list(configure_study(paper, "cloth", study)) == names
 
 
-def test_a_study_can_be_run_at_a_smaller_budget(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    chosen, written = [], []
-    monkeypatch.setattr(matrix, "run_tasks", lambda tasks, *_, **__: chosen.extend(tasks) or iter([("one", 1.0)]))
+def test_a_study_can_be_run_at_a_smaller_budget(
+    chosen: list[TrainConfig], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written = []
     monkeypatch.setattr(matrix.evaluation, "write_results", lambda rows, path: written.append(path))
     monkeypatch.setattr(matrix, "_find_row", lambda *_: ({"rmse_mean": 1.0}, {}))
     matrix.main("quick", study="robustness", steps=7)

@@ -122,14 +122,6 @@ def test_methods_baselines_and_chance_have_rows() -> None:
     assert {row.name for row in list_rows("chance")} == set(CHANCE)
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_methods_of_a_preset_differ_in_the_loss_alone(method: str) -> None:
-    preset = load_preset("quick")
-    model, mmgsd = configure_model(preset, "cloth", method), preset.train["cloth"]
-    assert dataclasses.replace(model, method="mmgsd", margin=mmgsd.margin) == mmgsd
-    assert (model.margin == 4.0) == (method in ("pcl", "spcl"))
-
-
 def test_a_row_differs_from_its_start_in_its_changes_alone() -> None:
     for object in OBJECTS:
         models = configure_study(PAPER, object, "main")
