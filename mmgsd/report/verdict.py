@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from mmgsd.files import DamagedFileError, quarantine, write_json, write_text
+from mmgsd.files import DamagedFileError, is_kept, write_json, write_text
 from mmgsd.paths import Paths
 from mmgsd.report.stages import find_run
 from mmgsd.studies.claims import get
@@ -71,14 +71,15 @@ def judge_run(paths: Paths) -> Verdict:
 def load_stored(paths: Paths) -> dict[str, Any]:
     """What was taken down: whether its run is ``running``, files' digests ``before`` and ``after``, and ``results``."""
     path, nothing = _find_stored(paths), {"running": False, "before": {}, "after": {}, "results": {}}
-    try:
-        state = read_table(path) if path.is_file() else nothing
+
+    def read(file: Path) -> dict[str, Any]:
+        """What a file says; DamagedFileError where it lacks a part."""
+        state = read_table(file)
         if not nothing.keys() <= state.keys():
-            raise DamagedFileError(f"{path} lacks some of {', '.join(nothing)}")
+            raise DamagedFileError(f"{file} lacks some of {', '.join(nothing)}")
         return state
-    except DamagedFileError:
-        quarantine(path)
-        return nothing
+
+    return read(path) if is_kept(path, read) else nothing
 
 
 def digest_files(paths: Paths) -> dict[str, str]:

@@ -19,12 +19,9 @@ from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
-from matplotlib import pyplot as plt
-from matplotlib.figure import Figure
 
 from mmgsd.command import Option
 from mmgsd.config import OBJECTS
-from mmgsd.figures.style import COLUMN_IN, finish_axes, styled
 from mmgsd.files import write_json
 from mmgsd.learn.adapt import STEPS, adapt, ask_left_out, read_adaptation
 from mmgsd.match.matcher import Matcher, load
@@ -143,31 +140,9 @@ def _say(part: pd.DataFrame, key: tuple[Any, ...]) -> str:
     return " / ".join(f"{100 * part.loc[key, name]:.0f} %" for name in COLUMNS) if key in part.index else MISSING
 
 
-@styled
-def plot_adaptation(results: Results, *, by: str = "name") -> Figure:
-    """Found within 5 % of the size against the number of photographs, an object a panel; dashed: other repositories."""
-    rows = tabulate(results)
-    rows = rows[rows["by"] == by]
-    objects = [name for name in OBJECTS if name in set(rows["object"])]
-    figure, axes = plt.subplots(1, len(objects), figsize=(COLUMN_IN, 1.9), layout="constrained", squeeze=False)
-    for axis, name in zip(axes[0], objects, strict=True):
-        for colour, kind in enumerate(KINDS):
-            for place, style in zip(ASKED, ("-", "--"), strict=True):
-                known = (rows["kind"] == kind) | (rows["count"] == 0)
-                shown = rows[known & (rows["object"] == name) & (rows["place"] == place)]
-                means = _average(shown, ["count"])["found@5%"]
-                axis.plot(means.index, 100 * means, f"o{style}", ms=3, color=f"C{colour}",
-                          label=f"{KINDS[kind]}, {ASKED[place]}")  # fmt: skip
-        axis.set(title=name.capitalize(), xlabel="photographs", ylim=(0, 100))
-    axes[0, 0].set_ylabel("found within 5 % (%)")
-    axes[0, -1].legend(fontsize=5)
-    return finish_axes(figure)
-
-
 STUDY = Study(
     "adaptation", 155, run, shows=lambda paths, **_: [paths.results.parent / RESULTS],
     tables={"adaptation": Shown(RESULTS, describe_adaptation)},
-    figures={"adaptation": lambda folder: plot_adaptation(read_results(folder.parent / RESULTS))},
 )  # fmt: skip
 
 

@@ -214,42 +214,22 @@ def _name_bin(first: float, last: float) -> str:
     return f"{first:g}" if first == last else f"{first:g}–{last:g}"
 
 
-def choose_worst(described: pd.DataFrame, count: int = 24) -> pd.DataFrame:
-    """The ``count`` queries with the greatest error, at most one of each pair of images, the worst first."""
-    return described.sort_values("rmse_px", ascending=False).drop_duplicates("pair").head(count)
-
-
-def plot_worst_queries(described: pd.DataFrame, data: Dataset, matcher: Any, *, count: int = 24) -> Figure:
-    """`plot_worst` of the queries of `choose_worst`, asked anew: a table of answers holds no heatmaps."""
-    rows, orbits = choose_worst(described, count), data.group()
-    matches = [
-        matcher.match(*map(data.load_image, (row.image0, row.image1)), data.xy[row.image0, [row.point]], n=int(row.n))
-        for row in rows.itertuples()
-    ]
-    true = [data.xy[row.image1][orbits.distinct_modes(row.point)] for row in rows.itertuples()]
-    return plot_worst(matches, true, rows.rmse_px.tolist())
-
-
 @style.styled
-def plot_worst(matches: Sequence[Match], true: Sequence[np.ndarray], errors_px: Sequence[float]) -> Figure:
-    """Source and target of each query side by side: the heatmap, the modes, and the ``true`` (n, 2) px as crosses.
+def plot_worst_queries(described: pd.DataFrame, data: Dataset, matcher: Any, *, count: int = 24) -> Figure:
+    """The ``count`` queries with the greatest error, at most one of each pair of images, the worst first.
 
-    A legend says what the signs are.
+    Source and target side by side: the heatmap, the modes, and crosses at the true matches; a legend says so. They are
+    asked anew, for a table of answers holds no heatmaps.
     """
-    columns, sheet = 4, [np.hstack([m.image0, m.image1]) for m in matches]
-    aspect = sheet[0].shape[0] / sheet[0].shape[1]
-    figure, axes = style.make_grid([aspect] * -(-len(matches) // columns), columns, style.PAGE_IN)
-    for axis, match, xy, error in zip(axes.flat, matches, true, errors_px, strict=False):
-        (height, width), left = match.image1.shape[:2], match.image0.shape[1]
-        axis.imshow(match.image0, extent=(-0.5 - left, -0.5, height - 0.5, -0.5))
-        blended = style.blend_heatmap(match.image1, match.compute_heatmap())
-        axis.imshow(blended, extent=(-0.5, width - 0.5, height - 0.5, -0.5))
-        axis.set(xlim=(-0.5 - left, width - 0.5), ylim=(height - 0.5, -0.5))
-        style.mark_pixel(axis, match.xy[0, 0] - left, match.xy[0, 1])
-        style.draw_modes(axis, match, 0)
-        style.mark_true(axis, xy)
-        axis.set_title(f"{error:.0f} px", fontsize=6)
-    for axis in axes.flat[len(matches) :]:
+    rows = described.sort_values("rmse_px", ascending=False).drop_duplicates("pair").head(count)
+    (width, height), columns = data.size, 4
+    figure, axes = style.make_grid([height / (2 * width)] * -(-len(rows) // columns), columns, style.PAGE_IN)
+    for axis, row in zip(axes.flat, rows.itertuples(), strict=False):
+        images = map(data.load_image, (row.image0, row.image1))
+        _draw_query(axis, matcher.match(*images, data.xy[row.image0, [row.point]], n=int(row.n)))
+        style.mark_true(axis, data.xy[row.image1][data.group().distinct_modes(row.point)])
+        axis.set_title(f"{row.rmse_px:.0f} px", fontsize=6)
+    for axis in axes.flat[len(rows) :]:
         axis.remove()
     signs = {"asked pixel": ("o", style.MARK, "black"), "mode": ("o", "none", style.MODE),
              "true match": ("x", style.TRUE, style.TRUE)}  # fmt: skip
@@ -257,6 +237,16 @@ def plot_worst(matches: Sequence[Match], true: Sequence[np.ndarray], errors_px: 
                for label, (m, face, edge) in signs.items()]  # fmt: skip
     figure.legend(handles=handles, loc="outside lower center", ncols=len(signs), fontsize=6)
     return figure
+
+
+def _draw_query(axis: Axes, match: Match) -> None:
+    (height, width), left = match.image1.shape[:2], match.image0.shape[1]
+    axis.imshow(match.image0, extent=(-0.5 - left, -0.5, height - 0.5, -0.5))
+    blended = style.blend_heatmap(match.image1, match.compute_heatmap())
+    axis.imshow(blended, extent=(-0.5, width - 0.5, height - 0.5, -0.5))
+    axis.set(xlim=(-0.5 - left, width - 0.5), ylim=(height - 0.5, -0.5))
+    style.mark_pixel(axis, match.xy[0, 0] - left, match.xy[0, 1])
+    style.draw_modes(axis, match, 0)
 
 
 STUDY = Study(

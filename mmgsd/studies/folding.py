@@ -69,6 +69,9 @@ class Rollout:
         return f"{self.task}-{self.start.replace(' ', '_')}-{self.ground}-{self.seed}"
 
 
+Arm = tuple[Policy, Rollout]
+
+
 def list_rollouts(object: str, count: int) -> list[Rollout]:
     """``count`` rollouts of an object, its tasks, their starts and the grounds in turn; then those of `MORE`."""
     kinds = [(task.name, start) for task in TASKS.values() if task.object == object for start in task.starts]
@@ -127,8 +130,8 @@ class Bench:
     def __init__(self, folder: Path, how: Mapping[str, Any]) -> None:
         self.folder, self.how = Path(folder), dict(how)
         self.demonstrated: dict[str, list[State]] = {}
-        self.ends: dict[tuple[Policy, Rollout], Path] = {}
-        self.acted: dict[tuple[Policy, Rollout], list[tuple[Path, PolicyAnswer]]] = {}  # each look, and what was done
+        self.ends: dict[Arm, Path] = {}
+        self.acted: dict[Arm, list[tuple[Path, PolicyAnswer]]] = {}  # each look, and what was done
 
     def make_starts(self, rollouts: list[Rollout]) -> dict[Rollout, Path]:
         """First states, and before them the states that the rollouts' demonstrations go through."""
@@ -163,7 +166,7 @@ class Bench:
     ) -> dict[str, dict[str, dict[str, Any]]]:
         """{policy: {rollout: how it ended}} of every policy from every first state."""
         files = {(policy, rollout): starts[rollout] for policy in policies for rollout in rollouts}
-        answers: dict[tuple[Policy, Rollout], list[PolicyAnswer]] = {arm: [] for arm in files}
+        answers: dict[Arm, list[PolicyAnswer]] = {arm: [] for arm in files}
         for number in range(max(len(find_task(rollout.task).looks) for rollout in rollouts)):
             going = [arm for arm in files if len(find_task(arm[1].task).looks) > number]
             for arm in ProgressBar(going, desc="answer", disable=not self.how["progress"], leave=False):
@@ -180,9 +183,8 @@ class Bench:
                               for rollout in rollouts} for policy in policies}  # fmt: skip
 
     def _look_again(
-        self, going: list[tuple[Policy, Rollout]], number: int, files: dict[tuple[Policy, Rollout], Path],
-        answers: dict[tuple[Policy, Rollout], list[PolicyAnswer]],
-    ) -> None:  # fmt: skip
+        self, going: list[Arm], number: int, files: dict[Arm, Path], answers: dict[Arm, list[PolicyAnswer]]
+    ) -> None:
         """Put the look and the answer in place that most questions agree in, where a policy looks again if few do."""
         first = {arm: files[arm] for arm in going}
         for again in range(1, max(policy.looks for policy, _ in going)):

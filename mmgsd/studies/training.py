@@ -90,12 +90,12 @@ def describe_runs(results: Results) -> Table:
 
 
 @styled
-def plot_training(logs: Mapping[str, pd.DataFrame], *, columns: int = 4) -> Figure:
+def plot_training(logs: Mapping[str, pd.DataFrame]) -> Figure:
     """Loss against step, a panel a model: ``logs`` {"cloth mmgsd": columns step, loss, seconds}, last word the method.
 
     Losses of different methods have different scales. Dark: mean of a tenth of the steps.
     """
-    columns = min(columns, len(logs))
+    columns = min(4, len(logs))
     rows = -(-len(logs) // columns)
     figure, axes = plt.subplots(rows, columns, figsize=(PAGE_IN * columns / 4, 1.5 * rows), layout="constrained",
                                 squeeze=False)  # fmt: skip

@@ -12,7 +12,6 @@ from mmgsd.measure.photographs import Photograph
 from mmgsd.paths import Paths
 from mmgsd.studies import adaptation
 from mmgsd.studies.adaptation import describe_adaptation, find_most, list_cells, measure_cell, run, tabulate
-from mmgsd.studies.registry import get_study
 from mmgsd.studies.table import to_markdown
 
 
@@ -75,5 +74,3 @@ def test_what_is_measured_is_kept_and_told(
         "| cloth, 2 with marks | 80 % / 10 % | – | 80 % / 10 % | – | +5% |",
     ]
     assert set(tabulate(results)["kind"]) == {"marked"}
-    drawn = get_study("adaptation").figures["adaptation"](paths.results).axes[0].lines
-    assert [line.get_ydata().tolist() for line in drawn[:2]] == [[60, 80], [60, 80]]

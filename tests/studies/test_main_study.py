@@ -116,7 +116,7 @@ def test_lines_that_lie_on_others_are_seen():
 
 def test_plot_training_has_a_panel_a_model():
     log = pd.DataFrame({"step": range(1, 6), "loss": [5.0, 4, 3, 2, 1], "seconds": range(60, 310, 60)})
-    figure = training.plot_training({"cloth mmgsd": log, "rope pcl": log, "rope mmgsd": log}, columns=2)
+    figure = training.plot_training({"cloth mmgsd": log, "rope pcl": log, "rope mmgsd": log})
     assert len(figure.axes) == 3
     assert figure.axes[0].lines[0].get_ydata().tolist() == [5, 4, 3, 2, 1]
     assert figure.axes[0].get_title() == "Cloth MMGSD · 5.0 min"
