@@ -12,7 +12,7 @@ from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 from PIL import Image
 
-from mmgsd.figures.style import MARK, PAGE_IN, check_filled, make_grid, mark_pixel, styled
+from mmgsd.figures.style import MARK, PAGE_IN, make_grid, mark_pixel, styled
 from mmgsd.files import atomic_write
 
 THUMBNAIL_PX, FRAME_PX = 160, 5  # sides of a picture, and of the frame that says whether it is a success
@@ -25,9 +25,8 @@ PANEL_IN = 2.4  # width of a picture with moves
 def plot_moves(pictures: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
     """Pictures beside each other, each (H, W, 3) uint8 with its moves (M, 2, 2) px: an arrow from pick to place.
 
-    The keys are the titles. ValueError where there is no picture.
+    The keys are the titles.
     """
-    check_filled("pictures", pictures)
     aspects = [max(image.shape[0] / image.shape[1] for image, _ in pictures.values())]
     figure, axes = make_grid(aspects, len(pictures), min(PAGE_IN, PANEL_IN * len(pictures)))
     for axis, (title, (image, moves)) in zip(axes[0], pictures.items(), strict=True):
@@ -43,15 +42,8 @@ def plot_moves(pictures: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
 
 @styled
 def plot_rollouts(pictures: Mapping[str, Mapping[str, np.ndarray]]) -> Figure:
-    """A row for each task, a column for each of its pictures (H, W, 3) uint8: {task's label: {what it shows: picture}}.
-
-    ValueError where there is no task, or tasks have other columns.
-    """
-    check_filled("pictures", pictures)
+    """A row for each task, a column for each of its pictures: {task's label: {what it shows: (H, W, 3) uint8}}."""
     columns = list(next(iter(pictures.values())))
-    for task, row in pictures.items():
-        if list(row) != columns:
-            raise ValueError(f"pictures must have the columns {columns} for each task, got {list(row)} of {task!r}")
     width = PAGE_IN / len(columns)
     figure, axes = plt.subplots(len(pictures), len(columns), figsize=(PAGE_IN, width * len(pictures) + 0.3),
                                 layout="constrained", squeeze=False)  # fmt: skip
@@ -78,11 +70,7 @@ def mark_moves(picture: np.ndarray, moves: np.ndarray) -> np.ndarray:
 
 
 def save_slides(slides: Sequence[tuple[np.ndarray, np.ndarray]], path: Path) -> Path:
-    """Write pairs of pictures (H, W, 3) uint8, their middle squares, as an animated WebP without end; its path.
-
-    ValueError where there is no pair.
-    """
-    check_filled("slides", slides)
+    """Write pairs of pictures (H, W, 3) uint8, their middle squares, as an animated WebP without end; its path."""
     frames = [Image.fromarray(np.hstack([crop_square(one, SLIDE_PX) for one in pair])) for pair in slides]
     with atomic_write(path) as aside:
         frames[0].save(aside, "WEBP", save_all=True, append_images=frames[1:], duration=SLIDE_MS, loop=0, quality=80)

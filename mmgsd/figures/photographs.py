@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from mmgsd.figures.plots import shrink_match
-from mmgsd.figures.style import PAGE_IN, check_filled, make_grid, mark_true, show_answer, show_source, styled
+from mmgsd.figures.style import PAGE_IN, make_grid, mark_true, show_answer, show_source, styled
 
 if TYPE_CHECKING:
     from mmgsd.match.match import Match
@@ -35,7 +35,8 @@ class ContactSheet:
     @styled
     def plot(self) -> Figure:
         """Where each question was, and beside it the answer with crosses at the marked places. ValueError for none."""
-        check_filled("the sheet", self._panels)
+        if not self._panels:
+            raise ValueError("the sheet must not be empty")
         matches = [match for match, _ in self._panels.values()]
         aspects = [max(image.shape[0] / image.shape[1] for image in (m.image0, m.image1)) for m in matches]
         rows = [max(aspects[k : k + COLUMNS // 2]) for k in range(0, len(matches), COLUMNS // 2)]

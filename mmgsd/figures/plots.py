@@ -14,19 +14,9 @@ from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.colors import hsv_to_rgb, rgb_to_hsv
 from matplotlib.figure import Figure
+from matplotlib.patches import ConnectionPatch
 
-from mmgsd.figures.style import (
-    MARK,
-    PAGE_IN,
-    check_filled,
-    compute_point_colours,
-    fade_image,
-    finish_axes,
-    make_grid,
-    show_answer,
-    show_source,
-    styled,
-)
+from mmgsd.figures import style
 
 if TYPE_CHECKING:
     from mmgsd.match.match import Match
@@ -36,7 +26,7 @@ MOST_MODES = 8  # of a material point under any group
 PAGE_QUERIES, PANEL_PX = 100, 640  # on one page at most; the longer side of an image in a panel of it
 
 
-@styled
+@style.styled
 def plot_match(match: Match, index: int = 0) -> Figure:
     """Source image with the pixel of one query, target image with heatmap and modes; the title gives the entropy.
 
@@ -47,15 +37,15 @@ def plot_match(match: Match, index: int = 0) -> Figure:
     whole = isinstance(index, int | np.integer) and not isinstance(index, bool)
     if not whole or not 0 <= index < len(match):
         raise ValueError(f"index must be in [0, {len(match)}), got {index!r}")
-    figure, axes = make_grid([match.image0.shape[0] / match.image0.shape[1]], 2, PAGE_IN * 0.7)
-    show_source(axes[0, 0], match, index)
-    show_answer(axes[0, 1], match, index)
+    figure, axes = style.make_grid([match.image0.shape[0] / match.image0.shape[1]], 2, style.PAGE_IN * 0.7)
+    style.show_source(axes[0, 0], match, index)
+    style.show_answer(axes[0, 1], match, index)
     axes[0, 0].set_title("Source")
     axes[0, 1].set_title(match.say_presence(index) or f"Matches · entropy {match.entropy[index]:.1f} nats")
     return figure
 
 
-@styled
+@style.styled
 def plot_page(match: Match) -> Figure:
     """All queries, two beside each other: the source's pixel, the answer, and above them number, pixel and entropy.
 
@@ -66,12 +56,12 @@ def plot_page(match: Match) -> Figure:
     small = shrink_match(match)
     aspect = max(image.shape[0] / image.shape[1] for image in (match.image0, match.image1))
     columns = 4 if len(match) > 1 else 2
-    figure, axes = make_grid([aspect] * -(-2 * len(match) // columns), columns, PAGE_IN)
+    figure, axes = style.make_grid([aspect] * -(-2 * len(match) // columns), columns, style.PAGE_IN)
     for axis in axes.flat[2 * len(match) :]:
         axis.set_axis_off()
     for index, (source, answer) in enumerate(axes.reshape(-1, 2)[: len(match)]):
-        show_source(source, small, index)
-        show_answer(answer, small, index)
+        style.show_source(source, small, index)
+        style.show_answer(answer, small, index)
         x, y = match.xy[index]
         source.set_title(f"{index + 1} · pixel {x:g}, {y:g}")
         said = match.say_presence(index).partition(":")[0]  # a panel has room for a word
@@ -95,36 +85,55 @@ def shrink_match(match: Match) -> Match:
     )  # fmt: skip
 
 
-@styled
-def plot_samples(images: Sequence[np.ndarray], titles: Sequence[str] | None = None, *, columns: int = 6) -> Figure:
-    """Contact sheet of (H, W, 3) images of one size. ValueError where there are none, or not one title each."""
-    check_filled("images", images)
-    if titles is not None and len(titles) != len(images):
-        raise ValueError(f"titles must be {len(images)}, one an image, got {len(titles)}")
-    aspect = images[0].shape[0] / images[0].shape[1]
-    figure, axes = make_grid([aspect] * -(-len(images) // columns), columns, PAGE_IN)
-    for axis, image, title in zip(axes.flat, images, titles or [""] * len(images), strict=False):
-        axis.imshow(image)
+@style.styled
+def plot_teaser(matches: Mapping[str, Match]) -> Figure:
+    """A row an object, of its match's first query: the source, the matches, to which lines lead, and the heatmap."""
+    aspects = [match.image1.shape[0] / match.image1.shape[1] for match in matches.values()]
+    figure, axes = style.make_grid(aspects, 3, style.COLUMN_IN)
+    for (source, target, answer), (name, match) in zip(axes, matches.items(), strict=True):
+        source.set_ylabel(name.capitalize())
+        target.imshow(match.image1)
+        target.autoscale(False)
+        _lead_to_matches(source, target, match)
+        style.show_source(source, match, 0)
+        style.show_answer(answer, match, 0)
+    for axis, title in zip(axes[0], ("Source", "Matches", "Heatmap"), strict=True):
         axis.set_title(title)
+    return figure
+
+
+def _lead_to_matches(source: Axes, target: Axes, match: Match) -> None:
+    for mode in match.modes[0][np.isfinite(match.modes[0]).all(-1)]:
+        ends = {"xyA": tuple(match.xy[0]), "xyB": tuple(mode), "coordsA": source.transData, "coordsB": target.transData}
+        for colour, width in (("black", 1.8), (style.MARK, 0.8)):
+            source.figure.add_artist(ConnectionPatch(**ends, color=colour, lw=width, zorder=2))
+        style.mark_pixel(target, *mode)
+
+
+@style.styled
+def plot_samples(images: Sequence[np.ndarray], *, columns: int = 6) -> Figure:
+    """Contact sheet of (H, W, 3) images of one size."""
+    aspect = images[0].shape[0] / images[0].shape[1]
+    figure, axes = style.make_grid([aspect] * -(-len(images) // columns), columns, style.PAGE_IN)
+    for axis, image in zip(axes.flat, images, strict=False):
+        axis.imshow(image)
     for axis in axes.flat[len(images) :]:
         axis.remove()
     return figure
 
 
-@styled
+@style.styled
 def plot_labels(
     image: np.ndarray, xy: np.ndarray, visible: np.ndarray, *, object: str = "cloth", orbit: Sequence[int] = ()
 ) -> Figure:
     """Image, and its material points ``xy`` (P, 2) px coloured by place on the object, hidden ones hollow.
 
-    The points of an ``orbit`` are ringed on both. ValueError where ``visible`` is not (P,).
+    The points of an ``orbit`` are ringed on both.
     """
-    if xy.ndim != 2 or visible.shape != xy.shape[:1] or not len(xy):
-        raise ValueError(f"xy must be (P, 2) and visible (P,), P > 0, got {xy.shape} and {visible.shape}")
-    figure, axes = make_grid([image.shape[0] / image.shape[1]], 2, PAGE_IN * 0.7)
-    colours = compute_point_colours(object, len(xy))
+    figure, axes = style.make_grid([image.shape[0] / image.shape[1]], 2, style.PAGE_IN * 0.7)
+    colours = style.compute_point_colours(object, len(xy))
     axes[0, 0].imshow(image)
-    axes[0, 1].imshow(fade_image(image))
+    axes[0, 1].imshow(style.fade_image(image))
     for axis in axes[0]:
         axis.autoscale(False)
     axes[0, 1].scatter(*xy[~visible].T, s=4, facecolors="none", edgecolors=colours[~visible], linewidths=0.4)
@@ -132,17 +141,16 @@ def plot_labels(
     for axis in axes[0]:
         chosen = xy[list(orbit)].reshape(-1, 2)
         axis.scatter(*chosen.T, s=50, facecolors="none", edgecolors="black", linewidths=2.2)
-        axis.scatter(*chosen.T, s=50, facecolors="none", edgecolors=MARK, linewidths=1.2)
+        axis.scatter(*chosen.T, s=50, facecolors="none", edgecolors=style.MARK, linewidths=1.2)
     return figure
 
 
-@styled
+@style.styled
 def plot_orbits(image: np.ndarray, xy: np.ndarray, groups: Mapping[str, Sequence[Sequence[int]]]) -> Figure:
     """A panel a symmetry group ({name: orbits, each of indices into ``xy`` (P, 2) px}), an orbit a colour."""
-    check_filled("groups", groups)
-    figure, axes = make_grid([image.shape[0] / image.shape[1]], len(groups), PAGE_IN)
+    figure, axes = style.make_grid([image.shape[0] / image.shape[1]], len(groups), style.PAGE_IN)
     for axis, (name, orbits) in zip(axes[0], groups.items(), strict=True):
-        axis.imshow(fade_image(image))
+        axis.imshow(style.fade_image(image))
         axis.autoscale(False)
         for colour, orbit in zip(_ORBIT_COLOURS, orbits, strict=False):
             axis.scatter(*xy[list(orbit)].T, s=26, color=colour, edgecolors="black", linewidths=0.6)
@@ -150,14 +158,13 @@ def plot_orbits(image: np.ndarray, xy: np.ndarray, groups: Mapping[str, Sequence
     return figure
 
 
-@styled
+@style.styled
 def plot_variety(tables: Mapping[str, pd.DataFrame], modes: Mapping[str, Mapping[str, Sequence[int]]]) -> Figure:
     """How the images differ, a row an object: states, visible share, hue of object and background, modes a point.
 
     ``tables`` {object: `mmgsd.dataset.measure_images`}, ``modes`` {object: {group: (P,) modes of each point}}.
     """
-    check_filled("tables", tables)
-    figure, axes = plt.subplots(len(tables), 4, figsize=(PAGE_IN, 1.6 * len(tables)), layout="constrained",
+    figure, axes = plt.subplots(len(tables), 4, figsize=(style.PAGE_IN, 1.6 * len(tables)), layout="constrained",
                                 squeeze=False)  # fmt: skip
     for line, (name, table) in zip(axes, tables.items(), strict=True):
         share = 100 * table.state.value_counts(normalize=True).sort_index()
@@ -167,7 +174,7 @@ def plot_variety(tables: Mapping[str, pd.DataFrame], modes: Mapping[str, Mapping
         line[1].set(xlabel="Visible material points (%)", ylabel="Images", xlim=(0, 100))
         _draw_hues(line[2], table)
         _draw_modes_a_point(line[3], modes[name])
-    return finish_axes(figure)
+    return style.finish_axes(figure)
 
 
 def _draw_modes_a_point(axis: Axes, groups: Mapping[str, Sequence[int]]) -> None:

@@ -5,7 +5,7 @@ Sizes are those of a two-column paper (3.5 and 7.1 in).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -174,9 +174,3 @@ def finish_axes(figure: Figure, *, keep_box: Sequence[Axes] = ()) -> Figure:
             seaborn.despine(ax=axis)
     plt.close(figure)
     return figure
-
-
-def check_filled(name: str, values: Sequence | Mapping | np.ndarray) -> None:
-    """ValueError that names the argument where it is empty."""
-    if len(values) == 0:
-        raise ValueError(f"{name} must not be empty")

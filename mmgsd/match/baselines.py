@@ -1,10 +1,10 @@
-"""What one would pick instead, asked the same dense question as a trained network: hand-made descriptors, SIFT, ORB and
-others, and dense features of any network by nearest neighbours, such as ImageNet's or DINOv2's.
+"""What one would pick instead, asked the same dense question as a trained network: hand-made descriptors, SIFT and
+ORB, and dense features of any network by nearest neighbours, such as ImageNet's or DINOv2's.
 
 A descriptor is computed at each source pixel and at each cell of a regular grid on the target's object; a softmax over
 their distances is the heatmap from which :mod:`mmgsd.match.matcher` reads the modes. Every window is 60 to 80 px wide,
-several times the spacing of the material points. SIFT, ORB and AKAZE are turned by the image's own orientation,
-estimated at each pixel as SIFT or ORB do at their keypoints; DAISY has none and stays upright.
+several times the spacing of the material points. Descriptors are turned by the image's own orientation, estimated at
+each pixel as SIFT and ORB do at their keypoints.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from typing import Any
 import cv2
 import numpy as np
 import scipy.ndimage
-import skimage.feature
 import torch
 from torch import Tensor
 
@@ -29,15 +28,13 @@ from mmgsd.match.mixture import AS_IT_IS, ModeReadout, check_modes
 from mmgsd.numerics import own_numerics
 
 EXTRACTORS: dict[str, Extractor] = {"imagenet": extract_imagenet, "dinov2": extract_dinov2}
-BASELINES = ("sift", "orb", "akaze", "daisy", "imagenet")
+BASELINES = ("sift", "orb", "imagenet")
 OPTIONAL = ("dinov2",)  # whose weights are no part of a clone: `mmgsd.extras.backbones` makes the file
-BINARY = ("orb", "akaze")  # compared by Hamming distance
 STRIDE_PX = 16  # between the candidates on the object: about a cell of the trained networks
 SHARPNESS = 2.0  # logits fall by this where the squared distance grows by its std over the object
 PAD_PX = 80  # reflected border: every window lies inside the padded image, so no detector drops a keypoint
 ANGLE_BINS, ANGLE_CELL_PX = 36, 4  # SIFT's orientation histogram; its gradients are pooled to cells of 4 px
 ORB_RADIUS_PX = 30  # radius of the disc whose centroid gives ORB's orientation
-DAISY_STEP_PX = 4  # DAISY is sampled on this lattice: a point is off by at most 2.8 px
 
 
 @dataclass(frozen=True)
@@ -52,7 +49,6 @@ class Window:
 WINDOWS = {
     "sift": Window(12.8, octave=2),  # std 6.4 = 1.6 * 2**2 px, window 6 sizes
     "orb": Window(62.0, octave=1),  # the 31 px patch at half the resolution
-    "akaze": Window(8.0, octave=2, level=8),  # window 10 sizes; the third octave's first of four levels
 }
 
 
@@ -155,8 +151,6 @@ def compute_descriptors(image: np.ndarray, xy: np.ndarray, *, method: str) -> np
     grey = np.pad(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), PAD_PX, mode="symmetric")
     if not len(xy):
         return np.zeros((0, 1), np.float32)
-    if method == "daisy":
-        return _describe_daisy(grey, xy + PAD_PX)
     return _describe_keypoints(grey, xy + PAD_PX, method)
 
 
@@ -195,27 +189,14 @@ def _describe_keypoints(grey: np.ndarray, xy: np.ndarray, method: str) -> np.nda
         cv2.KeyPoint(float(x), float(y), window.size_px, float(angle), 1.0, window.octave, window.level)
         for (x, y), angle in zip(xy, angles, strict=True)
     ]
-    kept, descriptors = _create_extractor(method).compute(grey, keypoints)
+    orb = method == "orb"
+    extractor = cv2.ORB_create(scaleFactor=2.0, nlevels=2, edgeThreshold=0) if orb else cv2.SIFT_create()
+    kept, descriptors = extractor.compute(grey, keypoints)
     assert len(kept) == len(xy), f"{method} dropped {len(xy) - len(kept)} keypoints"
-    if method in BINARY:
+    if orb:  # compared by Hamming distance
         bits = np.unpackbits(descriptors, axis=1)
         return 2 * bits.astype(np.float32) - 1
     return descriptors.astype(np.float32)
-
-
-def _create_extractor(method: str) -> cv2.Feature2D:
-    if method == "orb":
-        return cv2.ORB_create(scaleFactor=2.0, nlevels=2, edgeThreshold=0)
-    return cv2.AKAZE_create() if method == "akaze" else cv2.SIFT_create()
-
-
-def _describe_daisy(grey: np.ndarray, xy: np.ndarray) -> np.ndarray:
-    half = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    radius, step = 15, DAISY_STEP_PX // 2  # in px of the half-sized image
-    lattice = skimage.feature.daisy(half, step=step, radius=radius, rings=2, histograms=8, orientations=8)
-    cell = np.rint(((xy + 0.5) / 2 - 0.5 - radius) / step).astype(int)
-    columns, rows = (cell[:, k].clip(0, lattice.shape[1 - k] - 1) for k in (0, 1))
-    return lattice[rows, columns].astype(np.float32)
 
 
 def _orient_by_centroid(grey: np.ndarray, xy: np.ndarray) -> np.ndarray:

@@ -106,7 +106,7 @@ def measure_read(
 
 
 def name_read(name: str, row: Mapping[str, Any]) -> str:
-    """What a row read with its power and sharpness is called: "cloth-daisy@1,6"; at means, by its name alone."""
+    """What a row read with its power and sharpness is called: "cloth-orb@1,6"; at means, by its name alone."""
     power, sharpness = row["power"], row["sharpness"]
     return name if power == sharpness == 1 else f"{name}@{power:g},{sharpness:g}"
 

@@ -16,8 +16,8 @@ from typing import Any
 from mmgsd.config import IMAGE_SIZE, load_preset
 from mmgsd.files import write_text
 from mmgsd.paths import Paths, find_root
-from mmgsd.report.claims import describe_claims, list_claims
-from mmgsd.studies.registry import Shown, list_studies, load_results, told_where
+from mmgsd.report.tables import describe_claims, list_claims
+from mmgsd.studies.registry import Results, Shown, list_studies, load_results, told_where
 from mmgsd.studies.table import Table, lay_out
 
 NOT_RUN = r"\emph{Not run for this preset.}"
@@ -31,8 +31,6 @@ MARKUP = {  # of escaped text
     r"(?<=\d) \\%": r"\\,\\%", r"(?<=\d) (px|nats)\b": r"~\1", r" (\$\\to\$) ": r"\\,\1\\,", r"(?<!\w)-(?=\d)": "$-$",
 }  # fmt: skip
 CLAIMS = r"@{}>{\hsize=0.85\hsize}L>{\hsize=1.15\hsize}L>{\raggedright\arraybackslash}p{6.3em}L@{}"  # columns
-
-Results = Mapping[str, Any]
 
 
 def list_tables() -> dict[str, Shown]:

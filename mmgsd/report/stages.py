@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from mmgsd.files import DamagedFileError, locked, quarantine, write_json
+from mmgsd.files import DamagedFileError, is_kept, locked, write_json
 from mmgsd.paths import Paths
 from mmgsd.studies.registry import REMEDY, read_table
 
@@ -76,11 +76,7 @@ class Run:
 def load_state(paths: Paths) -> dict[str, Any]:
     """What run.json says; {} where there is none, and where it is damaged, which is set aside."""
     path = find_run(paths) / "run.json"
-    try:
-        return read_table(path) if path.is_file() else {}
-    except DamagedFileError:
-        quarantine(path)
-        return {}
+    return read_table(path) if is_kept(path, read_table) else {}
 
 
 def load_minutes(paths: Paths) -> dict[str, float]:

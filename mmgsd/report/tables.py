@@ -1,4 +1,7 @@
-"""The tables of Markdown files, made from the results: ``python -m mmgsd tables data/results README.md``."""
+"""The tables of Markdown files, made from the results: ``python -m mmgsd tables data/results README.md``.
+
+What was found, and the paper's claims, are made from the results of all studies, which judge their claims by a rule.
+"""
 
 from __future__ import annotations
 
@@ -7,15 +10,56 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from mmgsd.command import Option
+from mmgsd.config import OBJECTS
 from mmgsd.files import write_text
-from mmgsd.report.claims import describe_claims, make_findings
-from mmgsd.studies.registry import Shown, list_studies, load_results, read_table, told_where
-from mmgsd.studies.table import to_markdown
+from mmgsd.studies.claims import NOT_MEASURED, Claim, get
+from mmgsd.studies.registry import Results, Shown, list_studies, load_results, read_table, told_where
+from mmgsd.studies.table import Column, Table, to_markdown
 
+DETAIL = "data/results/README.md"  # seen from the README
 BEGIN, END = "<!-- NAME: made by `make readme` -->", "<!-- end of NAME -->"
 MARKED = re.compile(
     r"(?P<begin><!-- (?P<name>\w+): made by `make readme` -->\n).*?(?P<end>\n<!-- end of (?P=name) -->)", re.DOTALL
 )
+
+
+def list_claims(results: Results) -> list[Claim]:
+    """Every claim, judged from {name of the results file: its content}."""
+    return [judge(results) for study in list_studies() for judge in study.claims]
+
+
+def make_findings(results: Results) -> str:
+    """A Markdown list of the main findings, each with a link to its section of the results page."""
+    found = sorted((f for study in list_studies() for f in study.findings), key=lambda finding: finding.place)
+    return "\n".join(f"- [**{f.name}**]({DETAIL}#{f.section}){f.sentence.format(**f.count(results))}" for f in found)
+
+
+def describe_claims(results: Results) -> Table:
+    """The paper's claims: the rule, verdict, what was measured, what repeats it, minutes of training."""
+    columns = [
+        Column("rule", "counts as held where"), Column("verdict", "verdict", "here"),
+        Column("measured", "measured", "measured"), Column("command", page="repeat it by"),
+        Column("minutes", page="minutes"),
+    ]  # fmt: skip
+    rows = {}
+    for study in list_studies():
+        for claim in (judge(results) for judge in study.claims):
+            measured = "no results for this preset" if claim.verdict == NOT_MEASURED else claim.measured
+            said = {"rule": claim.rule, "verdict": f"**{claim.verdict}**", "measured": measured}
+            command = claim.command or f"`{study.notebook}`"
+            rows[claim.claim] = {"": {**said, "command": command, "minutes": sum_minutes(results, claim)}}
+    return Table("claim", {"": columns}, rows)
+
+
+def sum_minutes(results: Results, claim: Claim) -> str:
+    """Minutes that training a claim's models took, of both objects together; a dash where no file says."""
+    runs = [get(results, "runs", f"{name}-{model}") for name in OBJECTS for model in claim.models]
+    if claim.runs:
+        rows = results.get(claim.runs, {})
+        parts = [rows[name] for name in OBJECTS if name in rows] or [rows]
+        runs = [row.get("run") for part in parts for row in part.values()]
+    known = [run["minutes"] for run in runs if run]
+    return f"{sum(known):.0f}" if known else "–"
 
 
 def list_tables() -> dict[str, Shown]:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from mmgsd.files import DamagedFileError, quarantine, write_json, write_text
+from mmgsd.files import DamagedFileError, is_kept, write_json, write_text
 from mmgsd.paths import Paths
 from mmgsd.report.stages import find_run
 from mmgsd.studies.claims import get
@@ -60,7 +60,8 @@ def judge_run(paths: Paths) -> Verdict:
     with told_where(paths.results):
         numbers = compare_numbers(state["results"], found, paths)
     files = compare_files(state["before"], now)
-    hardware = [list_hardware(results) for results in (state["results"], found)]
+    hardware = [sorted({run["hardware"] for run in results.get("runs", {}).values()})
+                for results in (state["results"], found)]  # fmt: skip
     summary = summarise(numbers, files, hardware=hardware, meaningless=paths.preset == "smoke", stored=state["before"])
     write_text(find_run(paths) / "verdict.txt", summary)
     write_json(_find_stored(paths), {**state, "running": False, "after": now})
@@ -70,14 +71,15 @@ def judge_run(paths: Paths) -> Verdict:
 def load_stored(paths: Paths) -> dict[str, Any]:
     """What was taken down: whether its run is ``running``, files' digests ``before`` and ``after``, and ``results``."""
     path, nothing = _find_stored(paths), {"running": False, "before": {}, "after": {}, "results": {}}
-    try:
-        state = read_table(path) if path.is_file() else nothing
+
+    def read(file: Path) -> dict[str, Any]:
+        """What a file says; DamagedFileError where it lacks a part."""
+        state = read_table(file)
         if not nothing.keys() <= state.keys():
-            raise DamagedFileError(f"{path} lacks some of {', '.join(nothing)}")
+            raise DamagedFileError(f"{file} lacks some of {', '.join(nothing)}")
         return state
-    except DamagedFileError:
-        quarantine(path)
-        return nothing
+
+    return read(path) if is_kept(path, read) else nothing
 
 
 def digest_files(paths: Paths) -> dict[str, str]:
@@ -123,14 +125,11 @@ def judge_number(stored: float | None, found: float | None, tolerance: float) ->
 
 def measure_spreads(seeds: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> dict[tuple[str, str, str], float]:
     """{(object, method, measure): std over the seeds}, from {object: {"mmgsd-0": errors}}; none of a single seed."""
-    spreads = {}
-    for name, rows in seeds.items():
-        for method in dict.fromkeys(key.rpartition("-")[0] for key in rows):
-            each = [row for key, row in rows.items() if key.rpartition("-")[0] == method]
-            for measure in {measure.like for measure in list_measures().values()} & set(each[0]):
-                if len(each) > 1:
-                    spreads[name, method, measure] = float(np.std([row[measure] for row in each], ddof=1))
-    return spreads
+    known = {measure.like for measure in list_measures().values()}
+    rows = [(name, key.rpartition("-")[0], measure, value) for name, keyed in seeds.items()
+            for key, row in keyed.items() for measure, value in row.items() if measure in known]  # fmt: skip
+    table = pd.DataFrame(rows, columns=["object", "method", "measure", "value"]).astype({"value": float})
+    return table.groupby(["object", "method", "measure"])["value"].std().dropna().to_dict()
 
 
 def compute_tolerance(
@@ -149,11 +148,6 @@ def compare_files(before: Mapping[str, str], now: Mapping[str, str]) -> pd.DataF
     names = [name for name in sorted({*before, *now}) if before.get(name) != now.get(name)]
     said = ["new" if name not in before else "written anew" if name in now else "gone" for name in names]
     return pd.DataFrame({"file": said}, pd.Index(names, name="path"), dtype=object)
-
-
-def list_hardware(results: Mapping[str, Any]) -> list[str]:
-    """What the models of runs.json were trained on."""
-    return sorted({run["hardware"] for run in results.get("runs", {}).values()})
 
 
 def summarise(

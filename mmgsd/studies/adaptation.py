@@ -11,7 +11,6 @@ away. What is measured is kept, so that a killed call goes on.
 
 from __future__ import annotations
 
-import json
 import tempfile
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,19 +19,18 @@ from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
-from matplotlib import pyplot as plt
-from matplotlib.figure import Figure
 
 from mmgsd.command import Option
 from mmgsd.config import OBJECTS
-from mmgsd.figures.style import COLUMN_IN, check_filled, finish_axes, styled
 from mmgsd.files import write_json
 from mmgsd.learn.adapt import STEPS, adapt, ask_left_out, read_adaptation
 from mmgsd.match.matcher import Matcher, load
 from mmgsd.measure.evaluation import read_results
 from mmgsd.measure.photographs import Photograph, read_photographs
-from mmgsd.paths import find_root
+from mmgsd.paths import Paths, find_root
 from mmgsd.progress import ProgressBar
+from mmgsd.studies.registry import Results, Shown, Study
+from mmgsd.studies.table import MISSING, Table, make_page_table, to_markdown
 
 RESULTS = "adaptation.json"
 COUNTS = (2, 5, 10, 20)  # photographs that are learnt from
@@ -41,7 +39,7 @@ SPLITS = 5
 SOURCES = 2  # photographs of every split that are asked by
 LEFT = 4  # a part so large of a repository, at least, is left to be asked about
 ASKED = {"own": "same repository", "others": "other repositories"}
-COLUMNS = ("found@5%", "spurious")
+COLUMNS = ["found@5%", "spurious"]
 
 Cell = tuple[str, str, str, int, int]  # object, repository, kind, count, split; count 0: the weights as they are
 
@@ -63,28 +61,26 @@ def find_most(count: int) -> int:
 
 
 def run(
-    folder: Path | str, *, objects: Sequence[str] = OBJECTS, counts: Sequence[int] = COUNTS, splits: int = SPLITS,
-    steps: int = STEPS, weights: Mapping[str, str] | None = None, out: Path | None = None, progress: bool = True,
+    paths: Paths, *, folder: Path | str, objects: Sequence[str] = OBJECTS, counts: Sequence[int] = COUNTS,
+    splits: int = SPLITS, steps: int = STEPS, out: Path | None = None, progress: bool = True,
 ) -> Path:  # fmt: skip
-    """Measure every cell that is missing; returns the path of the results (default: data/results/adaptation.json).
+    """Measure every cell that is missing; the path of the results (default: data/results/adaptation.json).
 
-    ``weights`` {object: name or path} to go on from, by default the shipped ones. Errors are those of
-    `mmgsd.measure.photographs.read_photographs`.
+    Errors are those of `mmgsd.measure.photographs.read_photographs`.
     """
-    out = find_root() / "data" / "results" / RESULTS if out is None else out
+    out = out or paths.results.parent / RESULTS
     photographs = {object: read_photographs(folder, object) for object in objects}
     cells = list(list_cells(photographs, counts=counts, splits=splits))
     for cell in ProgressBar(cells, desc="adaptation", disable=not progress, leave=False):
         rows, key = read_results(out), "/".join(map(str, cell))
-        start = (weights or {}).get(cell[0], cell[0])
         if key not in rows:
-            write_json(out, {**rows, key: measure_cell(cell, photographs[cell[0]], start, steps=steps)})
+            write_json(out, {**rows, key: measure_cell(cell, photographs[cell[0]], steps=steps)})
     return out
 
 
-def measure_cell(cell: Cell, photographs: Sequence[Photograph], weights: str, *, steps: int) -> dict[str, Any]:
+def measure_cell(cell: Cell, photographs: Sequence[Photograph], *, steps: int) -> dict[str, Any]:
     """{"own", "others": {by: {measure: mean}}} and ``rmse_px`` of adapted weights on renders, or why they refused."""
-    _, repository, kind, count, split = cell
+    weights, repository, kind, count, split = cell
     own = [photograph for photograph in photographs if photograph.source == repository]
     order = np.random.default_rng(split).permutation(len(own))
     targets = {"own": [own[k] for k in order[find_most(len(own)) :]],
@@ -92,8 +88,11 @@ def measure_cell(cell: Cell, photographs: Sequence[Photograph], weights: str, *,
     sources = [own[k] for k in order[:SOURCES]]
     if not count:
         return _ask(load(weights), sources, targets)
+    entries = [{"file": str(photograph.path.absolute())} |
+               ({photograph.by: photograph.xy.tolist()} if kind == "marked" else {})
+               for photograph in (own[k] for k in order[:count])]  # fmt: skip
     with tempfile.TemporaryDirectory() as place:
-        index = write_json(Path(place) / "index.json", [_describe(own[k], kind) for k in order[:count]])
+        index = write_json(Path(place) / "index.json", entries)
         try:
             file = adapt(index, weights, Path(place) / "adapted.safetensors", steps=steps, folds=0, progress=False)
         except ValueError as error:  # such as nothing that the weights are sure of
@@ -101,22 +100,12 @@ def measure_cell(cell: Cell, photographs: Sequence[Photograph], weights: str, *,
         return _ask(load(file), sources, targets) | {"rmse_px": read_adaptation(file)["rmse_px"]}
 
 
-def _describe(photograph: Photograph, kind: str) -> dict[str, Any]:
-    """The index's entry of a photograph."""
-    entry = {"file": str(photograph.path.absolute())}
-    return entry | ({photograph.by: photograph.xy.tolist()} if kind == "marked" else {})
-
-
 def _ask(matcher: Matcher, sources: list[Photograph], targets: Mapping[str, list[Photograph]]) -> dict[str, Any]:
-    found = {}
-    for name, chosen in targets.items():
-        if chosen:
-            means = ask_left_out(matcher, sources, chosen).groupby("by")[list(COLUMNS)].mean().round(4)
-            found[name] = means.to_dict("index")
-    return found
+    return {name: ask_left_out(matcher, sources, chosen).groupby("by")[COLUMNS].mean().round(4).to_dict("index")
+            for name, chosen in targets.items() if chosen}  # fmt: skip
 
 
-def tabulate(results: Mapping[str, Any]) -> pd.DataFrame:
+def tabulate(results: Results) -> pd.DataFrame:
     """A row a cell, place ("own", "others") and way of asking; of cells that were not refused."""
     rows = []
     for key, found in results.items():
@@ -135,43 +124,26 @@ def _average(rows: pd.DataFrame, keys: list[str]) -> pd.DataFrame:
     return rows.groupby([*keys, "repository"])[[*COLUMNS, "grown"]].mean().groupby(keys).mean()
 
 
-def table(results: Mapping[str, Any]) -> str:
-    """Markdown: what is found and spurious by number of photographs, and how much renders' error grows."""
+def describe_adaptation(results: Results) -> Table:
+    """What is found and spurious by number of photographs, and how much renders' error grows."""
     means = _average(tabulate(results), ["object", "kind", "count", "place", "by"])
-    ways = [(place, by) for place in ASKED for by in ("name", "picture")]
-    heads = [f"{ASKED[place]}, by {by}: found / spurious" for place, by in ways]
-    lines = ["| | " + " | ".join([*heads, "renders' error"]) + " |", "|---" * (len(heads) + 2) + "|"]
+    ways, lines = [(place, by) for place in ASKED for by in ("name", "picture")], {}
     for (object, kind, count), part in means.groupby(level=[0, 1, 2], sort=False):
-        cells = [_format(part, (object, kind, count, *way)) for way in ways]
         label = f"{object}, {count} {KINDS[kind]}" if count else f"{object}, as shipped"
-        lines.append(f"| {' | '.join([label, *cells, f'{part.grown.mean():+.0%}'])} |")
-    return "\n".join(lines)
+        cells = [_say(part, (object, kind, count, *way)) for way in ways]
+        lines[label] = [*cells, f"{part.grown.mean():+.0%}"]
+    heads = [f"{ASKED[place]}, by {by}: found / spurious" for place, by in ways]
+    return make_page_table([*heads, "renders' error"], lines)
 
 
-def _format(part: pd.DataFrame, key: tuple[Any, ...]) -> str:
-    return " / ".join(f"{100 * part.loc[key, name]:.0f} %" for name in COLUMNS) if key in part.index else "–"
+def _say(part: pd.DataFrame, key: tuple[Any, ...]) -> str:
+    return " / ".join(f"{100 * part.loc[key, name]:.0f} %" for name in COLUMNS) if key in part.index else MISSING
 
 
-@styled
-def figure(results: Mapping[str, Any], *, by: str = "name") -> Figure:
-    """Found within 5 % of the size against the number of photographs, an object a panel; dashed: other repositories."""
-    check_filled("results", results)
-    rows = tabulate(results)
-    rows = rows[rows["by"] == by]
-    objects = [name for name in OBJECTS if name in set(rows["object"])]
-    figure, axes = plt.subplots(1, len(objects), figsize=(COLUMN_IN, 1.9), layout="constrained", squeeze=False)
-    for axis, name in zip(axes[0], objects, strict=True):
-        for colour, kind in enumerate(KINDS):
-            for place, style in zip(ASKED, ("-", "--"), strict=True):
-                known = (rows["kind"] == kind) | (rows["count"] == 0)
-                shown = rows[known & (rows["object"] == name) & (rows["place"] == place)]
-                means = _average(shown, ["count"])["found@5%"]
-                axis.plot(means.index, 100 * means, f"o{style}", ms=3, color=f"C{colour}",
-                          label=f"{KINDS[kind]}, {ASKED[place]}")  # fmt: skip
-        axis.set(title=name.capitalize(), xlabel="photographs", ylim=(0, 100))
-    axes[0, 0].set_ylabel("found within 5 % (%)")
-    axes[0, -1].legend(fontsize=5)
-    return finish_axes(figure)
+STUDY = Study(
+    "adaptation", 155, run, shows=lambda paths, **_: [paths.results.parent / RESULTS],
+    tables={"adaptation": Shown(RESULTS, describe_adaptation)},
+)  # fmt: skip
 
 
 def main(
@@ -184,5 +156,5 @@ def main(
     out: Annotated[Path, Option("another results file")] | None = None,
 ) -> None:
     """Measure what is missing, and print the table."""
-    found = run(folder, objects=object or OBJECTS, counts=counts, splits=splits, steps=steps, out=out)
-    print(table(json.loads(found.read_text("utf-8"))))
+    asked = {"objects": object or OBJECTS, "counts": counts, "splits": splits, "steps": steps, "out": out}
+    print(to_markdown(describe_adaptation(read_results(run(Paths(find_root(), "paper"), folder=folder, **asked)))))

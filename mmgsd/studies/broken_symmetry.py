@@ -5,6 +5,7 @@ PCL, told one match, is trained and asked on images with and without each.
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from mmgsd.model.tensors import describe_run
 from mmgsd.paths import Paths
 from mmgsd.scene.stage import render_dataset
 from mmgsd.studies.claims import Claim, fails, get, is_better, list_errors, say
-from mmgsd.studies.models import Model, configure_scene, configure_study, list_rows
+from mmgsd.studies.models import Model, configure_study, list_rows
 from mmgsd.studies.registry import Results, Shown, Study
 from mmgsd.studies.table import ERRORS, Column, Table
 from mmgsd.symmetry import load_group
@@ -54,7 +55,8 @@ def _measure(paths: Paths, object: str, row: Model, images: str, *, overwrite: b
     config, place, how = load_preset(images), Paths(paths.root, images), {"overwrite": overwrite}
     model = configure_study(load_preset(paths.preset), object, "fixes")[row.name]
     suffix = "-broken" if row.scene else ""
-    data = render_dataset(configure_scene(config, object, row), place.dataset(f"{object}{suffix}"), **how)
+    scene = dataclasses.replace(config.render[object], **row.scene)
+    data = render_dataset(scene, place.dataset(f"{object}{suffix}"), **how)
     weights = train_model(model, data, place.generated / "models" / f"{model.name}{suffix}", **how)
     told = {"modes": load_group(object, DEFAULT_GROUP[object]).order, **how}
     files = [evaluate_model(weights, data, config.evaluate, place.queries(f"{model.name}{suffix}-{group}"), group=group,

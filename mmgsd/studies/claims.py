@@ -70,6 +70,11 @@ def fails(share: float | None) -> bool | None:
     return None if share is None else share < FOUND
 
 
+def hold_all(parts: Sequence[bool | None]) -> bool | None:
+    """Whether all of a claim's parts hold; None where none fails and one was not measured."""
+    return False if False in parts else None if None in parts else True
+
+
 def get(results: Any, *keys: str) -> Any:
     """What lies under ``keys`` of nested results; None where one of them is missing."""
     for key in keys:

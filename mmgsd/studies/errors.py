@@ -16,21 +16,7 @@ from scipy.ndimage import distance_transform_cdt
 
 from mmgsd.config import OBJECTS, TrainConfig, load_preset
 from mmgsd.dataset import Dataset, load_dataset
-from mmgsd.figures.style import (
-    MARK,
-    MODE,
-    PAGE_IN,
-    TRUE,
-    blend_heatmap,
-    check_filled,
-    draw_modes,
-    finish_axes,
-    make_grid,
-    mark_pixel,
-    mark_true,
-    save_figure,
-    styled,
-)
+from mmgsd.figures import style
 from mmgsd.match.match import Match
 from mmgsd.match.matcher import Matcher
 from mmgsd.measure.evaluation import load_queries, read_results, write_results
@@ -78,8 +64,8 @@ def run(paths: Paths, *, method: str = "mmgsd", objects: Sequence[str] = OBJECTS
         tables[name] = describe_queries(load_queries(paths.queries(model.name)), data)
         explained[name], nats[name] = explain_errors(tables[name]), summarise_entropy(tables[name])
         sheet = plot_worst_queries(tables[name], data, Matcher.load(paths.model(model) / WEIGHTS), count=worst)
-        save_figure(sheet, paths.figures / f"worst_{name}{suffix}", kinds=("jpg",))
-    save_figure(plot_error_analysis(tables), paths.figures / f"error_analysis{suffix}")
+        style.save_figure(sheet, paths.figures / f"worst_{name}{suffix}", kinds=("jpg",))
+    style.save_figure(plot_error_analysis(tables), paths.figures / f"error_analysis{suffix}")
     file, other = (paths.results / f"{name}{suffix}.json" for name in ("errors", "entropy"))
     write_results(read_results(other) | nats, other)
     return write_results(read_results(file) | explained, file)
@@ -178,22 +164,22 @@ def count_findings(results: Results) -> dict[str, str]:
     return {"seen": f"{100 * hidden['no match hidden'] / hidden['all']:.0f} %"}
 
 
-@styled
+@style.styled
 def plot_error_analysis(tables: Mapping[str, pd.DataFrame]) -> Figure:
     """A row an object ({object: `describe_queries`}): mean RMSE by states, and against what may explain it.
 
     In brackets where fewer than ``FEW_PAIRS`` pairs of images have these states.
     """
-    check_filled("tables", tables)
-    figure, axes = plt.subplots(len(tables), 1 + len(QUESTIONS), figsize=(PAGE_IN, 2.1 * len(tables)), squeeze=False,
-                                layout="constrained", width_ratios=[1.5] + [1] * len(QUESTIONS))  # fmt: skip
+    size, ratios = (style.PAGE_IN, 2.1 * len(tables)), [1.5] + [1] * len(QUESTIONS)
+    figure, axes = plt.subplots(len(tables), len(ratios), figsize=size, squeeze=False, layout="constrained",
+                                width_ratios=ratios)  # fmt: skip
     for line, (name, table) in zip(axes, tables.items(), strict=True):
         _draw_states(line[0], table, name)
         for axis, (column, (label, edges)) in zip(line[1:], QUESTIONS.items(), strict=True):
             _draw_bins(axis, table, column, edges if name == "cloth" else LENGTHS.get(column, edges))
             axis.set(xlabel=label, ylim=(0, None))
         line[1].set_ylabel("RMSE (px)")
-    return finish_axes(figure, keep_box=axes[:, 0].tolist())
+    return style.finish_axes(figure, keep_box=axes[:, 0].tolist())
 
 
 def _draw_states(axis: Axes, table: pd.DataFrame, name: str) -> None:
@@ -228,49 +214,39 @@ def _name_bin(first: float, last: float) -> str:
     return f"{first:g}" if first == last else f"{first:g}–{last:g}"
 
 
-def choose_worst(described: pd.DataFrame, count: int = 24) -> pd.DataFrame:
-    """The ``count`` queries with the greatest error, at most one of each pair of images, the worst first."""
-    return described.sort_values("rmse_px", ascending=False).drop_duplicates("pair").head(count)
-
-
+@style.styled
 def plot_worst_queries(described: pd.DataFrame, data: Dataset, matcher: Any, *, count: int = 24) -> Figure:
-    """`plot_worst` of the queries of `choose_worst`, asked anew: a table of answers holds no heatmaps."""
-    rows, orbits = choose_worst(described, count), data.group()
-    matches = [
-        matcher.match(*map(data.load_image, (row.image0, row.image1)), data.xy[row.image0, [row.point]], n=int(row.n))
-        for row in rows.itertuples()
-    ]
-    true = [data.xy[row.image1][orbits.distinct_modes(row.point)] for row in rows.itertuples()]
-    return plot_worst(matches, true, rows.rmse_px.tolist())
+    """The ``count`` queries with the greatest error, at most one of each pair of images, the worst first.
 
-
-@styled
-def plot_worst(matches: Sequence[Match], true: Sequence[np.ndarray], errors_px: Sequence[float]) -> Figure:
-    """Source and target of each query side by side: the heatmap, the modes, and the ``true`` (n, 2) px as crosses.
-
-    A legend says what the signs are.
+    Source and target side by side: the heatmap, the modes, and crosses at the true matches; a legend says so. They are
+    asked anew, for a table of answers holds no heatmaps.
     """
-    check_filled("matches", matches)
-    columns, sheet = 4, [np.hstack([m.image0, m.image1]) for m in matches]
-    aspect = sheet[0].shape[0] / sheet[0].shape[1]
-    figure, axes = make_grid([aspect] * -(-len(matches) // columns), columns, PAGE_IN)
-    for axis, match, xy, error in zip(axes.flat, matches, true, errors_px, strict=False):
-        (height, width), left = match.image1.shape[:2], match.image0.shape[1]
-        axis.imshow(match.image0, extent=(-0.5 - left, -0.5, height - 0.5, -0.5))
-        blended = blend_heatmap(match.image1, match.compute_heatmap())
-        axis.imshow(blended, extent=(-0.5, width - 0.5, height - 0.5, -0.5))
-        axis.set(xlim=(-0.5 - left, width - 0.5), ylim=(height - 0.5, -0.5))
-        mark_pixel(axis, match.xy[0, 0] - left, match.xy[0, 1])
-        draw_modes(axis, match, 0)
-        mark_true(axis, xy)
-        axis.set_title(f"{error:.0f} px", fontsize=6)
-    for axis in axes.flat[len(matches) :]:
+    rows = described.sort_values("rmse_px", ascending=False).drop_duplicates("pair").head(count)
+    (width, height), columns = data.size, 4
+    figure, axes = style.make_grid([height / (2 * width)] * -(-len(rows) // columns), columns, style.PAGE_IN)
+    for axis, row in zip(axes.flat, rows.itertuples(), strict=False):
+        images = map(data.load_image, (row.image0, row.image1))
+        _draw_query(axis, matcher.match(*images, data.xy[row.image0, [row.point]], n=int(row.n)))
+        style.mark_true(axis, data.xy[row.image1][data.group().distinct_modes(row.point)])
+        axis.set_title(f"{row.rmse_px:.0f} px", fontsize=6)
+    for axis in axes.flat[len(rows) :]:
         axis.remove()
-    signs = {"asked pixel": ("o", MARK, "black"), "mode": ("o", "none", MODE), "true match": ("x", TRUE, TRUE)}
+    signs = {"asked pixel": ("o", style.MARK, "black"), "mode": ("o", "none", style.MODE),
+             "true match": ("x", style.TRUE, style.TRUE)}  # fmt: skip
     handles = [Line2D([], [], ls="", marker=m, mfc=face, mec=edge, ms=5, label=label)
                for label, (m, face, edge) in signs.items()]  # fmt: skip
     figure.legend(handles=handles, loc="outside lower center", ncols=len(signs), fontsize=6)
     return figure
+
+
+def _draw_query(axis: Axes, match: Match) -> None:
+    (height, width), left = match.image1.shape[:2], match.image0.shape[1]
+    axis.imshow(match.image0, extent=(-0.5 - left, -0.5, height - 0.5, -0.5))
+    blended = style.blend_heatmap(match.image1, match.compute_heatmap())
+    axis.imshow(blended, extent=(-0.5, width - 0.5, height - 0.5, -0.5))
+    axis.set(xlim=(-0.5 - left, width - 0.5), ylim=(height - 0.5, -0.5))
+    style.mark_pixel(axis, match.xy[0, 0] - left, match.xy[0, 1])
+    style.draw_modes(axis, match, 0)
 
 
 STUDY = Study(

@@ -17,7 +17,6 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from mmgsd.dataset import Dataset
-from mmgsd.figures.style import check_filled
 from mmgsd.files import DamagedFileError, write_bytes
 from mmgsd.match.match import Match
 from mmgsd.match.matcher import Matcher, read_heatmap
@@ -90,7 +89,6 @@ def choose_contrast(data: FigureData) -> int:
 
 def compute_object_size(masks: Sequence[np.ndarray]) -> float:
     """Diagonal of the object's bounding box in px, mean over (H, W) bool masks."""
-    check_filled("masks", masks)
     spans = [np.ptp(np.argwhere(mask), axis=0) + 1 for mask in masks]
     return float(np.linalg.norm(spans, axis=1).mean())
 

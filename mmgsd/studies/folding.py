@@ -24,8 +24,8 @@ from mmgsd.checks import check_choice
 from mmgsd.command import Option
 from mmgsd.config import DEFAULT_GROUP, OBJECTS
 from mmgsd.figures.folding import mark_moves, mark_success, plot_rollouts, save_slides
-from mmgsd.figures.style import PAGE_IN, check_filled, finish_axes, save_figure, styled
-from mmgsd.files import DamagedFileError, quarantine, read_json, write_json
+from mmgsd.figures.style import PAGE_IN, finish_axes, save_figure, styled
+from mmgsd.files import is_kept, read_json, write_json
 from mmgsd.fold.consensus import Motion
 from mmgsd.fold.demonstration import Demonstration, Look, write_demonstration
 from mmgsd.fold.jobs import act_job, demonstration_job, look_job, run_jobs, start_job, true_moves
@@ -39,7 +39,7 @@ from mmgsd.progress import ProgressBar
 from mmgsd.studies.claims import Claim, get, list_shares
 from mmgsd.studies.policies import POLICIES, SHIPPED, TRAINED_BY, Policy, ask, digest_policy, draw_moves
 from mmgsd.studies.registry import Results, Shown, Study
-from mmgsd.studies.table import Table, make_page_table
+from mmgsd.studies.table import MISSING, Table, make_page_table
 from mmgsd.symmetry import load_group
 
 ROLLOUTS = {"smoke": 2, "quick": 36, "paper": 100}  # of each policy and object
@@ -69,6 +69,9 @@ class Rollout:
         return f"{self.task}-{self.start.replace(' ', '_')}-{self.ground}-{self.seed}"
 
 
+Arm = tuple[Policy, Rollout]
+
+
 def list_rollouts(object: str, count: int) -> list[Rollout]:
     """``count`` rollouts of an object, its tasks, their starts and the grounds in turn; then those of `MORE`."""
     kinds = [(task.name, start) for task in TASKS.values() if task.object == object for start in task.starts]
@@ -78,64 +81,47 @@ def list_rollouts(object: str, count: int) -> list[Rollout]:
             for seed, (chosen, k) in enumerate(turns)]  # fmt: skip
 
 
-def run_folding(
-    preset: str, root: Path, *, policies: Iterable[Policy] = SHIPPED, workers: int = 0,
-    scheduler: str = "", progress: bool = True,
-) -> Path:  # fmt: skip
+def run(
+    paths: Paths, *, policies: Iterable[Policy] = SHIPPED, workers: int = 0, scheduler: str = "", progress: bool = True
+) -> Path:
     """Run a preset's rollouts of some policies, write what came of them, and draw one of each task; the results' path.
 
-    What is drawn are these policies, where `REFERENCE` is one of them.
-
-    ``workers`` and ``scheduler`` are as `run_jobs` has them.
-
-    Rows of other policies that the results hold stay. ValueError for a preset without rollouts.
+    Drawn are these policies, where `REFERENCE` is one of them. Rows of other policies that the results hold stay.
+    ``workers`` and ``scheduler`` are as `run_jobs` has them. ValueError for a preset without rollouts.
     """
-    check_choice("preset", preset, tuple(ROLLOUTS))
-    paths = Paths(root, preset)
+    check_choice("preset", paths.preset, tuple(ROLLOUTS))
     bench = Bench(paths.generated / "folding", {"workers": workers, "scheduler": scheduler, "progress": progress})
-    out = paths.results / "folding.json"
+    out, ours = paths.results / "folding.json", POLICIES[REFERENCE]
     rows = read_json(out)["policies"] if out.is_file() else {name: {} for name in OBJECTS}
     policies, pictures, slides = list(policies), {}, []
     for object in OBJECTS:
-        rollouts = list_rollouts(object, ROLLOUTS[preset])
+        rollouts = list_rollouts(object, ROLLOUTS[paths.preset])
         starts = bench.make_starts(rollouts)
         kept = [rollout for rollout in rollouts if not read_state(starts[rollout]).about["fault"]]
         found = bench.roll(policies, kept, starts)
+        untouched = {rollout.name: bench.judge(rollout, starts[rollout], []) for rollout in kept}
+        rows[object] = summarise_policies(rows[object], {"nothing": untouched} | found)
         shown = choose_shown(kept, found.get(REFERENCE, {}))
         pictures |= bench.list_pictures(policies, shown, starts, found)
-        slides += [pair for policy in policies if policy.name == REFERENCE for pair in bench.list_slides(policy, shown)]
-        untouched = bench.judge_untouched({rollout: starts[rollout] for rollout in kept})
-        done = {name for name, row in untouched.items() if row["success"]}
-        reachable = {key for key, row in found.get("truth", {}).items() if row["success"]} - done
-        rows[object]["nothing"] = summarise_rollouts(untouched, reachable)
-        for policy in policies:
-            rows[object][policy.name] = summarise_rollouts(found[policy.name], reachable)
-        rows[object] = {name: rows[object][name] for name in POLICIES if name in rows[object]}
-        if REFERENCE in rows[object]:
-            ours = rows[object][REFERENCE]["rollouts"]
-            for row in rows[object].values():
-                row["beyond"] = compare_rollouts(ours, row["rollouts"], reachable)
+        slides += bench.list_slides(ours, shown) if ours in policies else []
     if slides:
         save_figure(plot_rollouts(pictures), paths.figures / "folding", kinds=("jpg",))
         save_slides(slides, paths.figures / "folding.webp")
-    results = {"run": {"rollouts": ROLLOUTS[preset]}, "policies": rows}
-    if any("reachable" in row for policies_ in rows.values() for row in policies_.values()):
+    results = {"run": {"rollouts": ROLLOUTS[paths.preset]}, "policies": rows}
+    if any("reachable" in row for found in rows.values() for row in found.values()):
         save_figure(plot_success(results), paths.figures / "folding_success", kinds=("png",))
     return write_json(out, results)
 
 
-def write_demonstrations(root: Path, *, workers: int = 0, scheduler: str = "", progress: bool = True) -> list[Path]:
-    """Write what policies are shown of each task as files of the format that a user's demonstrations have; their paths.
+def write_demonstrations(root: Path, **how: Any) -> list[Path]:
+    """Write what policies are shown of each task to ``data/demonstrations``, as a user's demonstrations are; the paths.
 
-    To ``data/demonstrations``, by name of the task. ``workers`` and ``scheduler`` are as `run_jobs` has them.
+    ``how``, the workers, scheduler and progress, is as `run_jobs` has it.
     """
-    how = {"workers": workers, "scheduler": scheduler, "progress": progress}
-    bench = Bench(Paths(root, "quick").generated / "folding", how)
+    bench, folder = Bench(Paths(root, "quick").generated / "folding", how), root / "data" / "demonstrations"
     bench.demonstrate(TASKS.values())
-    folder = root / "data" / "demonstrations"
-    files = {task: folder / f"{task.name}.json" for task in TASKS.values()}
-    return [write_demonstration(bench.make_demonstration(task), file, quality=DEMONSTRATION_QUALITY)
-            for task, file in files.items()]  # fmt: skip
+    return [write_demonstration(bench.make_demonstration(task), folder / f"{task.name}.json",
+                                quality=DEMONSTRATION_QUALITY) for task in TASKS.values()]  # fmt: skip
 
 
 class Bench:
@@ -144,8 +130,8 @@ class Bench:
     def __init__(self, folder: Path, how: Mapping[str, Any]) -> None:
         self.folder, self.how = Path(folder), dict(how)
         self.demonstrated: dict[str, list[State]] = {}
-        self.ends: dict[tuple[Policy, Rollout], Path] = {}
-        self.acted: dict[tuple[Policy, Rollout], list[tuple[Path, PolicyAnswer]]] = {}  # each look, and what was done
+        self.ends: dict[Arm, Path] = {}
+        self.acted: dict[Arm, list[tuple[Path, PolicyAnswer]]] = {}  # each look, and what was done
 
     def make_starts(self, rollouts: list[Rollout]) -> dict[Rollout, Path]:
         """First states, and before them the states that the rollouts' demonstrations go through."""
@@ -155,19 +141,16 @@ class Bench:
         return {rollout: files[rollout.name] for rollout in rollouts}
 
     def demonstrate(self, tasks: Iterable[Task]) -> None:
-        """The states that tasks' demonstrations go through."""
-        for task in tasks:
-            self.demonstrated.setdefault(task.name, self._demonstrate(task))
-
-    def _demonstrate(self, task: Task) -> list[State]:
-        """The states before, between and after a task's looks, each look by its own places."""
-        folder, jobs = self.folder / "demonstrations", {f"{task.name}_0": demonstration_job(task, 0)}
-        states = [run_jobs(jobs, folder, **self.how)[f"{task.name}_0"]]
-        for number, look in enumerate(task.looks, 1):
-            moves = true_moves(look, read_state(states[0]).points, read_state(states[-1]))
-            name = f"{task.name}_{number}"
-            states.append(run_jobs({name: act_job(states[-1], moves)}, folder, **self.how)[name])
-        return [read_state(state) for state in states]
+        """The states before, between and after tasks' looks, each look by its own places."""
+        folder = self.folder / "demonstrations"
+        for task in (task for task in tasks if task.name not in self.demonstrated):
+            files = run_jobs({f"{task.name}_0": demonstration_job(task, 0)}, folder, **self.how)
+            states = [read_state(files[f"{task.name}_0"])]
+            for number, look in enumerate(task.looks, 1):
+                moves, name = true_moves(look, states[0].points, states[-1]), f"{task.name}_{number}"
+                files |= run_jobs({name: act_job(files[f"{task.name}_{number - 1}"], moves)}, folder, **self.how)
+                states.append(read_state(files[name]))
+            self.demonstrated[task.name] = states
 
     def make_demonstration(self, task: Task) -> Demonstration:
         """What a policy is shown of a task: images, picks and places, and anchors where they are seen."""
@@ -178,16 +161,12 @@ class Bench:
             looks.append(Look(state.image, pixels.reshape(-1, 2, 2), state.xy[anchors].astype(float)))
         return Demonstration(task.object, tuple(looks))
 
-    def judge_untouched(self, starts: Mapping[Rollout, Path]) -> dict[str, dict[str, Any]]:
-        """{rollout: how it is before anything is done}: who does nothing must not be praised."""
-        return {rollout.name: self._judge(rollout, file, []) for rollout, file in starts.items()}
-
     def roll(
         self, policies: list[Policy], rollouts: list[Rollout], starts: dict[Rollout, Path]
     ) -> dict[str, dict[str, dict[str, Any]]]:
         """{policy: {rollout: how it ended}} of every policy from every first state."""
         files = {(policy, rollout): starts[rollout] for policy in policies for rollout in rollouts}
-        answers: dict[tuple[Policy, Rollout], list[PolicyAnswer]] = {arm: [] for arm in files}
+        answers: dict[Arm, list[PolicyAnswer]] = {arm: [] for arm in files}
         for number in range(max(len(find_task(rollout.task).looks) for rollout in rollouts)):
             going = [arm for arm in files if len(find_task(arm[1].task).looks) > number]
             for arm in ProgressBar(going, desc="answer", disable=not self.how["progress"], leave=False):
@@ -200,13 +179,12 @@ class Bench:
             made = run_jobs(jobs, self.folder / "acts", **self.how)
             files |= {arm: made[name] for arm, name in names.items()}
         self.ends |= files
-        return {policy.name: {rollout.name: self._judge(rollout, files[policy, rollout], answers[policy, rollout])
+        return {policy.name: {rollout.name: self.judge(rollout, files[policy, rollout], answers[policy, rollout])
                               for rollout in rollouts} for policy in policies}  # fmt: skip
 
     def _look_again(
-        self, going: list[tuple[Policy, Rollout]], number: int, files: dict[tuple[Policy, Rollout], Path],
-        answers: dict[tuple[Policy, Rollout], list[PolicyAnswer]],
-    ) -> None:  # fmt: skip
+        self, going: list[Arm], number: int, files: dict[Arm, Path], answers: dict[Arm, list[PolicyAnswer]]
+    ) -> None:
         """Put the look and the answer in place that most questions agree in, where a policy looks again if few do."""
         first = {arm: files[arm] for arm in going}
         for again in range(1, max(policy.looks for policy, _ in going)):
@@ -231,16 +209,12 @@ class Bench:
         rows = {}
         for task in (task for task in TASKS.values() if task.name in rollouts):
             shown, rollout = self.demonstrated[task.name], rollouts[task.name]
-            row = {
-                "demonstrated": shown[0].image,
-                "its end": shown[-1].image,
-                "found": read_state(starts[rollout]).image,
-            }
-            seen = [policy for policy in policies if policy.looks == 1]  # what looks again mostly does the same
-            rows[task.label] = row | {
-                policy.label: mark_success(read_state(self.ends[policy, rollout]).image,
-                                           found[policy.name][rollout.name]["success"]) for policy in seen
-            }  # fmt: skip
+            row = {"demonstrated": shown[0].image, "its end": shown[-1].image,
+                   "found": read_state(starts[rollout]).image}  # fmt: skip
+            for policy in (policy for policy in policies if policy.looks == 1):  # looking again mostly changes nothing
+                success = found[policy.name][rollout.name]["success"]
+                row[policy.label] = mark_success(read_state(self.ends[policy, rollout]).image, success)
+            rows[task.label] = row
         return rows
 
     def list_slides(self, policy: Policy, rollouts: Mapping[str, Rollout]) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -261,12 +235,15 @@ class Bench:
         look = f"-look{again}" if again else ""
         place = self.folder / "answers" / f"{policy.name}-{rollout.name}-{number}{look}.json"
         mark = {"state": state.about["mark"], "policy": digest_policy(policy, task.object)}
-        kept = _read_answer(place, mark)
+        kept = read_kept(place, mark)
         if kept is None:
-            kept = self._ask(policy, rollout, number, state, before[0].motion if before else None)
-            motion = None if kept.motion is None else _to_list(kept.motion)
-            write_json(place, {"mark": mark, "moves": kept.moves.tolist(), "motion": motion, "share": kept.share})
-        return kept
+            answer = self._ask(policy, rollout, number, state, before[0].motion if before else None)
+            parts = answer.motion and (answer.motion.factor, answer.motion.shift)
+            motion = parts and [[value.real, value.imag] for value in parts]
+            kept = {"mark": mark, "moves": answer.moves.tolist(), "motion": motion, "share": answer.share}
+            write_json(place, kept)
+        motion = kept["motion"] and Motion(*(complex(*pair) for pair in kept["motion"]))
+        return PolicyAnswer(np.array(kept["moves"], float).reshape(-1, 2, 2), motion, kept["share"])
 
     def _ask(self, policy: Policy, rollout: Rollout, number: int, state: State, motion: Motion | None) -> PolicyAnswer:
         task = find_task(rollout.task)
@@ -283,7 +260,8 @@ class Bench:
         pixels = state.project(np.column_stack([moves, np.zeros(len(moves))])) if len(moves) else moves
         return PolicyAnswer(pixels.reshape(-1, 2, 2), answer.motion, answer.share)
 
-    def _judge(self, rollout: Rollout, file: Path, answers: list[PolicyAnswer]) -> dict[str, Any]:
+    def judge(self, rollout: Rollout, file: Path, answers: list[PolicyAnswer]) -> dict[str, Any]:
+        """How a rollout ended, in the state of a file, and the least share of questions that agreed in an answer."""
         state, task = read_state(file), find_task(rollout.task)
         group = load_group(task.object, DEFAULT_GROUP[task.object]).permutations
         end, side = self.demonstrated[task.name][-1].points, SIDES_M[task.object]
@@ -314,9 +292,7 @@ def find_on_table(xy: np.ndarray, state: State) -> np.ndarray:
 def summarise_rollouts(rows: dict[str, dict[str, Any]], reachable: set[str]) -> dict[str, Any]:
     """Errors (share of the side), overlap and success of all rollouts, of those ``reachable``, by task; caution.
 
-    ``reachable`` are the rollouts that the true matches succeed in, and that are no success before anything is done:
-    the others say something of the bench. "cautious": success of those where at least `AGREES` of the questions agree,
-    and how many these are.
+    "cautious": success of those where at least `AGREES` of the questions agree, and how many these are.
     """
     groups = {"all": list(rows.values()), "reachable": [row for name, row in rows.items() if name in reachable]}
     groups |= {task: [row for row in rows.values() if row["task"] == task] for task in TASKS}
@@ -332,40 +308,49 @@ def summarise_rollouts(rows: dict[str, dict[str, Any]], reachable: set[str]) -> 
     return {**said, "cautious": estimate_share(sure), "faults": faults, "rollouts": each}
 
 
-def _read_answer(path: Path, mark: dict[str, str]) -> PolicyAnswer | None:
-    """What is kept of the same question; a damaged file is set aside."""
-    if not path.is_file():
-        return None
-    try:
-        kept = read_json(path)
-        if kept["mark"] != mark:
-            return None
-        motion = None if kept["motion"] is None else Motion(*(complex(*pair) for pair in kept["motion"]))
-        return PolicyAnswer(np.array(kept["moves"], float).reshape(-1, 2, 2), motion, float(kept["share"]))
-    except (DamagedFileError, KeyError, TypeError, ValueError):
-        quarantine(path)
-        return None
+def summarise_policies(
+    stored: Mapping[str, Any], found: Mapping[str, dict[str, dict[str, Any]]]
+) -> dict[str, dict[str, Any]]:
+    """Rows of the policies whose rollouts were ``found`` to end so, and of others that are ``stored``, in their order.
+
+    Rollouts count that the true matches succeed in, and that are no success where "nothing" is done.
+    """
+    done = {name for name, row in found["nothing"].items() if row["success"]}
+    reachable = {name for name, row in found.get("truth", {}).items() if row["success"]} - done
+    rows = {**stored, **{name: summarise_rollouts(ended, reachable) for name, ended in found.items()}}
+    if REFERENCE in rows:
+        for row in rows.values():
+            row["beyond"] = compare_rollouts(rows[REFERENCE]["rollouts"], row["rollouts"], reachable)
+    return {name: rows[name] for name in POLICIES if name in rows}
 
 
-def _to_list(motion: Motion) -> list[list[float]]:
-    return [[value.real, value.imag] for value in (motion.factor, motion.shift)]
+def read_kept(path: Path, mark: Mapping[str, Any]) -> dict[str, Any] | None:
+    """What a file keeps of the question with this ``mark``, or None; a damaged file is set aside."""
+    return read_json(path) if is_kept(path, lambda file: read_json(file).get("mark") == mark) else None
 
 
 def describe_folding(results: Results) -> Table:
     """A row a policy: success and error of the rollouts that count; how many of all end as true matches do.
 
-    Those count that the true matches succeed in, and that are no success before anything is done; all, with an error
-    at most `SLACK` above that of the true matches, end as these. With 95 % intervals, of shares Wilson's; what was not
-    measured is a dash.
+    Which count is as in `summarise_policies`; all, with an error at most `SLACK` above that of the true matches, end as
+    these. With 95 % intervals, of shares Wilson's; what was not measured is a dash.
     """
     heads = [f"{name}: {head}" if head == HEADS[0] else head for name in OBJECTS for head in HEADS]
     rows, lines = results["policies"], {}
     for name, policy in POLICIES.items():
-        found = [rows[object].get(name) for object in OBJECTS]
-        if any(found):
-            lines[policy.label] = [cell for object, row in zip(OBJECTS, found, strict=True)
-                                   for cell in _list_cells(row, _list_like_truth(rows[object], name))]  # fmt: skip
+        if any(name in rows[object] for object in OBJECTS):
+            lines[policy.label] = [cell for object in OBJECTS for cell in _list_cells(rows[object], name)]
     return make_page_table(heads, lines)
+
+
+def _list_cells(rows: Mapping[str, Any], name: str) -> list[str]:
+    row = rows.get(name, {})
+    if "reachable" not in row:
+        return [MISSING] * len(HEADS)
+    success = say_share(row["reachable"]["success"])
+    same = say_share(estimate_share(list(_list_like_truth(rows, name).values())))
+    error, every = (f"{100 * row[part]['error']['mean']:.1f} %" for part in ("reachable", "all"))
+    return [success, same, error, say_beyond(row["beyond"]["error"]), every]
 
 
 def describe_starts(results: Results) -> Table:
@@ -392,32 +377,24 @@ def _list_like_truth(rows: Mapping[str, Any], name: str) -> dict[str, bool]:
 
 def make_folding_sentence(results: Results) -> str:
     """How many rollouts count, and what caution brings."""
-    said = [f"{object.capitalize()}: {_say_object(results['policies'][object])}" for object in OBJECTS]
-    return f"{'. '.join(said)}."
+    said = [f"{object.capitalize()}: {_say_object(results['policies'][object])}." for object in OBJECTS]
+    return " ".join(said)
 
 
 def _say_object(rows: Mapping[str, Any]) -> str:
     truth = rows["truth"]
     counted = truth["reachable"]["success"]["count"] if "reachable" in truth else 0
-    parts = [f"{counted} of {truth['all']['success']['count']} rollouts count"]
-    sure = rows.get("mmgsd", {}).get("cautious", {"count": 0})
+    said = f"{counted} of {truth['all']['success']['count']} rollouts count"
+    sure = get(rows, "mmgsd", "cautious") or {"count": 0}
     if sure["count"]:
-        parts.append(f"MMGSD succeeds in {100 * sure['mean']:.0f} % of the {sure['count']} whose modes agree most")
-    return "; ".join(parts)
-
-
-def _list_cells(row: Mapping[str, Any] | None, like: Mapping[str, bool]) -> list[str]:
-    if not row or "reachable" not in row:
-        return ["–"] * len(HEADS)
-    success, same = say_share(row["reachable"]["success"]), say_share(estimate_share(list(like.values())))
-    error, every = (f"{100 * row[part]['error']['mean']:.1f} %" for part in ("reachable", "all"))
-    return [success, same, error, say_beyond(row["beyond"]["error"]), every]
+        said += f"; MMGSD succeeds in {100 * sure['mean']:.0f} % of the {sure['count']} whose modes agree most"
+    return said
 
 
 def say_share(share: Mapping[str, Any]) -> str:
     """A share with its 95 % interval; a dash of none."""
     if share["mean"] is None:
-        return "–"
+        return MISSING
     return f"{100 * share['mean']:.0f} % ({100 * share['low']:.0f} to {100 * share['high']:.0f})"
 
 
@@ -428,7 +405,7 @@ def say_beyond(more: Mapping[str, Any]) -> str:
 
 
 def _count(values: Sequence[bool]) -> str:
-    return f"{sum(values)} of {len(values)}" if values else "–"
+    return f"{sum(values)} of {len(values)}" if values else MISSING
 
 
 def tabulate_errors(results: Results) -> pd.DataFrame:
@@ -466,32 +443,23 @@ def judge_several(results: Results) -> Claim:
 
 @styled
 def plot_success(results: Mapping[str, Any]) -> Figure:
-    """A panel for each object: how often each policy succeeds in the rollouts that count, with 95 % intervals.
-
-    ``results`` as `mmgsd.studies.folding` stores them; a policy that was not measured has no dot. ValueError of none.
-    """
+    """A panel for each object: how often each policy succeeds in the rollouts that count, with 95 % intervals."""
     rows = results["policies"]
     names = [name for name in POLICIES if any("reachable" in rows[object].get(name, {}) for object in OBJECTS)]
-    check_filled("results", names)
     size = PAGE_IN, 0.7 + 0.2 * len(names)
     figure, axes = plt.subplots(1, len(OBJECTS), figsize=size, layout="constrained", sharey=True)
     for axis, object in zip(axes, OBJECTS, strict=True):
         for place, name in enumerate(names):
-            said = rows[object].get(name, {}).get("reachable", {}).get("success")
+            said = get(rows, object, name, "reachable", "success")
             if said:
                 mean, low, high = (100 * said[key] for key in ("mean", "low", "high"))
                 axis.errorbar(mean, place, xerr=[[mean - low], [high - mean]], fmt="o", ms=4, capsize=2,
                               color=POLICIES[name].colour)  # fmt: skip
-        counted = rows[object].get("truth", {}).get("reachable", {}).get("success", {}).get("count", 0)
+        counted = get(rows, object, "truth", "reachable", "success", "count") or 0
         axis.set(title=f"{object.capitalize()}, {counted} rollouts", xlabel="Success (%)", xlim=(-4, 104))
     axes[0].set_yticks(range(len(names)), [POLICIES[name].label.replace("`", "") for name in names])
     axes[0].invert_yaxis()
     return finish_axes(figure)
-
-
-def run(paths: Paths, **how: Any) -> Path:
-    """`run_folding` of a preset."""
-    return run_folding(paths.preset, paths.root, **how)
 
 
 STUDY = Study(
@@ -525,4 +493,4 @@ def main(
     if not any(only in policy.name for policy in asked):
         names = ", ".join(policy.name for policy in asked)
         raise ValueError(f"--only {only!r}: no policy has a name with that; there are {names}")
-    print(run_folding(preset, find_root(), policies=policies, **how))
+    print(run(Paths(find_root(), preset), policies=policies, **how))

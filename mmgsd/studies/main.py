@@ -18,25 +18,11 @@ from scipy.ndimage import gaussian_filter1d
 
 from mmgsd.config import METHODS, N_POINTS, OBJECTS, TrainConfig, load_preset
 from mmgsd.dataset import load_dataset
-from mmgsd.figures.answers import get_aspect, plot_teaser
-from mmgsd.figures.style import (
-    COLUMN_IN,
-    MARK,
-    PAGE_IN,
-    add_legend,
-    blend_heatmap,
-    check_filled,
-    finish_axes,
-    make_grid,
-    mark_true,
-    name_grid,
-    show_answer,
-    show_source,
-    styled,
-)
+from mmgsd.figures import style
+from mmgsd.figures.plots import plot_teaser
 from mmgsd.match.match import Match
 from mmgsd.measure import evaluation
-from mmgsd.measure.metrics import BIN_PX, ErrorSummary
+from mmgsd.measure.metrics import BIN_PX
 from mmgsd.measure.questions import choose_points
 from mmgsd.model.tensors import WEIGHTS
 from mmgsd.paths import Paths, find_root
@@ -195,75 +181,38 @@ def count_findings(results: Results) -> dict[str, str]:
     }  # fmt: skip
 
 
-def draw_teaser(results: Path) -> Figure:
-    """A pair of the sample that needs no explanation, as the shipped weights answer it, whatever the results."""
-    root = find_root()
-    return plot_teaser({name: [figure_data.ask_plain(load_shipped(name), load_sample(root, name))] for name in OBJECTS})
-
-
-def compare_answers(drawn: Mapping[str, FigureData]) -> tuple[dict[str, dict[str, Match]], dict[str, np.ndarray]]:
-    """{object: {method: answer}} and true matches of the example's query about which the errors differ most."""
-    query = {name: figure_data.choose_contrast(data) for name, data in drawn.items()}
-    compared = {name: {m: match[query[name]] for m, match in data.answers.items()} for name, data in drawn.items()}
-    return compared, {name: data.true[query[name]] for name, data in drawn.items()}
-
-
-def draw_combined(results: Path) -> Figure:
-    """`plot_combined` of `compare_answers`."""
-    drawn = load_drawn(results)
-    return plot_combined(*compare_answers(drawn), {name: data.answers["mmgsd"] for name, data in drawn.items()})
-
-
-def draw_rmse_pdf(results: Path) -> Figure:
-    """`plot_rmse_pdf` of both objects."""
-    drawn = load_drawn(results)
-    return plot_rmse_pdf({name: data.errors for name, data in drawn.items()},
-                         {name: data.object_size_px for name, data in drawn.items()})  # fmt: skip
-
-
-def draw_spatial_rmse(results: Path) -> Figure:
-    """`plot_spatial_rmse` of both objects."""
-    return plot_spatial_rmse({name: data.errors for name, data in load_drawn(results).items()})
-
-
-@styled
-def plot_rmse_pdf(errors: Mapping[str, Mapping[str, ErrorSummary]], object_sizes_px: Mapping[str, float]) -> Figure:
+@style.styled
+def plot_rmse_pdf(drawn: Mapping[str, FigureData]) -> Figure:
     """Probability density of the error of a query with a visible source, as a percentage of the object's size.
 
-    ``errors`` {object: {method: summary}}, a panel an object, a line a method, chance dashed. The object's size is the
-    diagonal of its bounding box, mean over the test images (``compute_object_size``). Smoothed with a std of 1 %.
+    A panel an object, a line a method, chance dashed. The object's size is the diagonal of its bounding box, mean over
+    the test images (``compute_object_size``). Smoothed with a std of 1 %.
     """
-    for name, methods in {"": errors, **errors}.items():
-        check_filled(f"errors[{name!r}]" if name else "errors", methods)
-    figure, axes = plt.subplots(len(errors), 1, figsize=(COLUMN_IN, 0.4 + 1.4 * len(errors)), layout="constrained",
+    figure, axes = plt.subplots(len(drawn), 1, figsize=(style.COLUMN_IN, 0.4 + 1.4 * len(drawn)), layout="constrained",
                                 sharex=True, squeeze=False)  # fmt: skip
     far = 0.0
-    for axis, (name, methods) in zip(axes[:, 0], errors.items(), strict=True):
-        step = 100 * BIN_PX / object_sizes_px[name]  # %
-        for method, summary in methods.items():
+    for axis, (name, data) in zip(axes[:, 0], drawn.items(), strict=True):
+        step = 100 * BIN_PX / data.object_size_px  # %
+        for method, summary in data.errors.items():
             axis.plot(*compute_density(summary.histogram, step), **get_line_style(method))
             cumulated = np.cumsum(summary.histogram)
-            if method not in CHANCE_STYLES or len(methods) == 1:  # chance would leave half of the axis empty
+            if method not in CHANCE_STYLES:  # chance would leave half of the axis empty
                 far = max(far, step * (1 + int(np.searchsorted(cumulated, SHOWN * cumulated[-1]))))
         axis.set(title=name.capitalize(), ylabel="Density per %", ylim=(0, None))
     axes[-1, 0].set(xlabel="Error (% of the object's bounding-box diagonal)", xlim=(0, far))
-    add_legend(figure, axes[:, 0])
-    return finish_axes(figure)
+    style.add_legend(figure, axes[:, 0])
+    return style.finish_axes(figure)
 
 
-@styled
-def plot_spatial_rmse(
-    errors: Mapping[str, Mapping[str, ErrorSummary]], *, mapped: Sequence[str] = ("mmgsd", "spcl")
-) -> Figure:
+@style.styled
+def plot_spatial_rmse(drawn: Mapping[str, FigureData], *, mapped: Sequence[str] = ("mmgsd", "spcl")) -> Figure:
     """Mean error over the rope's length for every method (1-D), and over the cloth's area for those ``mapped`` (2-D).
 
-    ``errors`` {"rope", "cloth": {method: summary}}; each map, of the ``mapped`` that are in it, has a scale of its own,
-    so that a lesser error's map is not flat; points never asked stay grey.
+    Each map has a scale of its own, so that a lesser error's map is not flat; points never asked stay grey.
     """
-    for name in ("rope", "cloth"):
-        check_filled(f"errors[{name!r}]", errors.get(name, {}))
+    errors = {name: data.errors for name, data in drawn.items()}
     mapped = [method for method in mapped if method in errors["cloth"]]
-    figure, axes = plt.subplots(1, 1 + len(mapped), figsize=(PAGE_IN, 2.1), layout="constrained",
+    figure, axes = plt.subplots(1, 1 + len(mapped), figsize=(style.PAGE_IN, 2.1), layout="constrained",
                                 width_ratios=[1.8] + [1.0] * len(mapped))  # fmt: skip
     for method, summary in errors["rope"].items():
         seen = np.flatnonzero(summary.asked)
@@ -275,72 +224,65 @@ def plot_spatial_rmse(
         image = axis.imshow(values, cmap=colormaps["viridis"].with_extremes(bad="0.85"))
         axis.set_title(f"Cloth · {get_label(method, short=True)}, RMSE (px)")
         figure.colorbar(image, ax=axis, shrink=0.8)
-    name_grid(axes[1:])
-    add_legend(figure, axes[:1])
-    return finish_axes(figure, keep_box=axes[1:])
+    style.name_grid(axes[1:])
+    style.add_legend(figure, axes[:1])
+    return style.finish_axes(figure, keep_box=axes[1:])
 
 
-@styled
-def plot_combined(
-    answers: Mapping[str, Mapping[str, Match]], true: Mapping[str, np.ndarray], inwards: Mapping[str, Match],
-    *, sigma_px: float = 10.0,
-) -> Figure:  # fmt: skip
+@style.styled
+def plot_combined(drawn: Mapping[str, FigureData], *, sigma_px: float = 10.0) -> Figure:
     """A: contrastive answers, B: the true and MMGSD's distribution of the same query, C: queries moved inwards.
 
-    ``answers`` {object: {"pcl", "spcl", "mmgsd": match}}, first query of each, contrastive ones where they are
-    trained; ``true`` {object: (n, 2) px}, crosses, and in B Gaussians of ``sigma_px``, wide enough to be seen;
-    ``inwards`` {object: match of four queries, extremity first}. Modes are rings with their 1-std ellipses.
+    A and B are about the example's query of which the methods differ most (`choose_contrast`), contrastive ones where
+    they are trained; true matches are crosses, and in B Gaussians of ``sigma_px``, wide enough to be seen. C is about
+    all four queries, extremity first. Modes are rings with their 1-std ellipses.
     """
-    check_filled("answers", answers)
-    for name, match in inwards.items():
-        if len(match.xy) != 4:
-            raise ValueError(f"inwards[{name!r}] must hold 4 queries, got {len(match.xy)}")
-    aspects = [get_aspect(m["mmgsd"]) for m in answers.values()] + [get_aspect(m) for m in inwards.values()]
-    figure, axes = make_grid(aspects, 5, PAGE_IN)
-    for line, (name, methods) in zip(axes, answers.items(), strict=False):
-        _draw_comparison(line, methods, true[name], sigma_px)
-        line[0].set_ylabel(name.capitalize())
-    for line, (name, match) in zip(axes[len(answers) :], inwards.items(), strict=True):
-        _draw_inwards(line, match)
-        line[0].set_ylabel(name.capitalize())
+    ours = [data.answers["mmgsd"] for data in drawn.values()]
+    aspects = [match.image1.shape[0] / match.image1.shape[1] for match in ours]
+    figure, axes = style.make_grid(2 * aspects, 5, style.PAGE_IN)
+    for line, inwards, (name, data) in zip(axes, axes[len(drawn) :], drawn.items(), strict=False):
+        query = figure_data.choose_contrast(data)
+        answers = {method: match[query] for method, match in data.answers.items()}
+        _draw_comparison(line, answers, data.true[query], sigma_px)
+        _draw_inwards(inwards, data.answers["mmgsd"])
+        for axis in (line[0], inwards[0]):
+            axis.set_ylabel(name.capitalize())
     for axis, title in zip(axes[0], (r"$\bf{A}$  Source", "PCL", "SPCL", r"$\bf{B}$  True", "MMGSD"), strict=True):
         axis.set_title(title)
-    if inwards:
-        axes[len(answers), 0].set_title(r"$\bf{C}$  Sources 1–4")
+    axes[len(drawn), 0].set_title(r"$\bf{C}$  Sources 1–4")
     return figure
 
 
 def _draw_comparison(line: Sequence[Axes], methods: Mapping[str, Match], true: np.ndarray, sigma_px: float) -> None:
     match = methods["mmgsd"]
-    show_source(line[0], match, 0)
+    style.show_source(line[0], match, 0)
     for axis, method in zip(line[[1, 2, 4]], ("pcl", "spcl", "mmgsd"), strict=True):
         if method in methods:
-            show_answer(axis, methods[method], 0)
-            mark_true(axis, true)
+            style.show_answer(axis, methods[method], 0)
+            style.mark_true(axis, true)
         else:
             axis.set_axis_off()
             axis.text(0.5, 0.5, "not trained", ha="center", va="center", fontsize=6, transform=axis.transAxes)
     ys, xs = np.mgrid[: match.image1.shape[0], : match.image1.shape[1]]
     mixture = sum(np.exp(-((xs - x) ** 2 + (ys - y) ** 2) / (2 * sigma_px**2)) for x, y in true)
-    line[3].imshow(blend_heatmap(match.image1, mixture))
-    mark_true(line[3], true)
+    line[3].imshow(style.blend_heatmap(match.image1, mixture))
+    style.mark_true(line[3], true)
 
 
 def _draw_inwards(line: Sequence[Axes], match: Match) -> None:
     line[0].imshow(match.image0)
     for index, (x, y) in enumerate(match.xy):
         line[0].text(x, y, str(index + 1), ha="center", va="center", fontsize=5.5, zorder=3,
-                     bbox={"boxstyle": "circle,pad=0.15", "fc": MARK, "ec": "black", "lw": 0.6})  # fmt: skip
-        show_answer(line[index + 1], match, index)
+                     bbox={"boxstyle": "circle,pad=0.15", "fc": style.MARK, "ec": "black", "lw": 0.6})  # fmt: skip
+        style.show_answer(line[index + 1], match, index)
         line[index + 1].set_title(f"{index + 1} · {match.entropy[index]:.1f} nats")
 
 
 def compute_density(histogram: np.ndarray, step: float, *, bandwidth: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     """Centres (K,) and density (K,) of a histogram of values ≥ 0 in bins of width ``step``.
 
-    It is smoothed by a Gaussian, mirrored at zero. ValueError where the histogram counts nothing.
+    It is smoothed by a Gaussian, mirrored at zero.
     """
-    check_filled("histogram", histogram[histogram > 0])
     padded = np.pad(histogram, (0, int(np.ceil(5 * bandwidth / step))))
     density = gaussian_filter1d(padded / (padded.sum() * step), bandwidth / step, mode="reflect")
     return (np.arange(len(padded)) + 0.5) * step, density
@@ -356,8 +298,13 @@ STUDY = Study(
         "quick": Shown("quick/rmse.json", describe_main),
         "presets": Shown(("quick/rmse.json", "paper/rmse.json"), describe_presets),
     },
-    figures={"teaser": draw_teaser, "combined": draw_combined, "rmse_pdf": draw_rmse_pdf,
-             "spatial_rmse": draw_spatial_rmse},
+    figures={
+        "teaser": lambda _: plot_teaser(  # of the sample, as the shipped weights answer it, whatever the results
+            {name: figure_data.ask_plain(load_shipped(name), load_sample(find_root(), name)) for name in OBJECTS}),
+        "combined": lambda results: plot_combined(load_drawn(results)),
+        "rmse_pdf": lambda results: plot_rmse_pdf(load_drawn(results)),
+        "spatial_rmse": lambda results: plot_spatial_rmse(load_drawn(results)),
+    },
     claims=(judge_rmse, partial(judge_rmse, row="mmgsd"), judge_improvement),
     findings=(
         Finding(1, "The paper's own loss", " has {plain} px on cloth and rope, {gain} below SPCL.",

@@ -19,36 +19,19 @@ from typing import Annotated, Any
 
 import torch
 
-from mmgsd.checks import read_count
 from mmgsd.cluster import open_client, open_processes, wait_for_each
 from mmgsd.cluster import run_tasks as run_on_workers
 from mmgsd.command import Option
 from mmgsd.config import OBJECTS, Preset, TrainConfig, load_preset
 from mmgsd.files import DamagedFileError
 from mmgsd.learn.training import train_model
-from mmgsd.measure.evaluation import (
-    BASELINES,
-    CHANCE,
-    evaluate_baseline,
-    evaluate_model,
-    load_queries,
-    read_results,
-    summarise,
-    write_results,
-)
+from mmgsd.measure import evaluation
 from mmgsd.model.network import find_device
 from mmgsd.model.tensors import WEIGHTS, describe_run
 from mmgsd.paths import Paths, find_root
 from mmgsd.progress import ProgressBar
-from mmgsd.studies.models import (
-    RUN,
-    STUDIES,
-    configure_study,
-    list_rows,
-    list_runs,
-    vary_seed,
-    vary_sigma,
-)
+from mmgsd.studies.claims import get
+from mmgsd.studies.models import RUN, STUDIES, configure_study, list_rows, list_runs, vary_seed, vary_sigma
 from mmgsd.studies.parameters import read_scheduler
 
 TABLES = ("budget", "robustness", "backbones")  # studies with a file of their own, of models under their rows' names
@@ -57,14 +40,6 @@ PROCESSES = 4  # side by side at most: each takes a gigabyte
 VALIDATIONS = 8  # RMSE on held-out simulations, in a model's log
 
 Task = TrainConfig | tuple[str, str]  # a model to train and ask, or an object and a baseline to ask
-
-
-def list_repeats(preset: Preset, seeds: int, *, steps: int = 0) -> list[TrainConfig]:
-    """The models compared by seeds, of other ``steps`` than its where they are not 0: all with seed 0, then 1…"""
-    rows = vary_seed(range(seeds))
-    keyed = {object: configure_study(preset, object, "seeds", rows, steps=steps) for object in OBJECTS}
-    models = [keyed[object][row.name] for row in rows for object in OBJECTS]
-    return sorted(models, key=lambda model: model.seed)
 
 
 def list_tasks(preset: Preset, studies: Sequence[str] = RUN) -> list[Task]:
@@ -95,11 +70,11 @@ def run_task(
             every = max(1, model.steps // VALIDATIONS)
             weights = train_model(model, data, paths.model(model), progress=progress, validate_every=every)
         how = {"group": task.group, "progress": progress}
-        out = evaluate_model(weights, data, preset.evaluate, paths.queries(name), **how)
+        out = evaluation.evaluate_model(weights, data, preset.evaluate, paths.queries(name), **how)
     else:
         data, out = paths.dataset(task[0]), paths.queries(name)
-        evaluate_baseline(task[1], data, preset.evaluate, out, progress=progress)
-    queries = load_queries(out)
+        evaluation.evaluate_baseline(task[1], data, preset.evaluate, out, progress=progress)
+    queries = evaluation.load_queries(out)
     return name, float(queries.rmse_px[queries.visible].mean())
 
 
@@ -133,7 +108,7 @@ def train_and_ask(
     data, config = paths.dataset(model.object), load_preset(paths.preset).evaluate
     weights = train_model(model, data, paths.model(model), overwrite=overwrite, progress=progress)
     how = {"group": group, "overwrite": overwrite, "progress": progress}
-    return weights, evaluate_model(weights, data, config, paths.queries(model.name), **how)
+    return weights, evaluation.evaluate_model(weights, data, config, paths.queries(model.name), **how)
 
 
 def run_each(
@@ -161,9 +136,12 @@ def _work_quietly(function: Callable[..., Any], threads: int, task: Any) -> Any:
 
 
 def choose_tasks(preset: Preset, *, study: str = "", seeds: int = 0, steps: int = 0) -> list[Task]:
-    """The models compared by ``seeds``; those of a ``study``, of so many ``steps`` each; or all of `RUN`."""
+    """The models compared by ``seeds``, seed after seed; those of a ``study``, of other ``steps``; or all of `RUN`."""
     if seeds:
-        return list_repeats(preset, seeds, steps=steps)
+        rows = vary_seed(range(seeds))
+        keyed = {object: configure_study(preset, object, "seeds", rows, steps=steps) for object in OBJECTS}
+        models = [keyed[object][row.name] for row in rows for object in OBJECTS]
+        return sorted(models, key=lambda model: model.seed)
     if steps:
         return [model for name in OBJECTS for model in configure_study(preset, name, study, steps=steps).values()]
     return list_tasks(preset, (study,) if study else RUN)
@@ -182,10 +160,8 @@ def run_matrix(
     done = run_tasks(tasks, preset, root, scheduler=scheduler)
     for name, rmse in ProgressBar(done, total=len(tasks), desc="models and baselines"):
         ProgressBar.write(f"{name}: {rmse:.1f} px")
-        if seeds:
-            write_seed_table(preset, root, seeds, steps=steps)
-        elif steps:
-            write_study_table(preset, root, study, steps=steps)
+        if seeds or steps:
+            write_study_table(preset, root, "seeds" if seeds else study, values=range(seeds), steps=steps)
         else:
             write_tables(preset, root)
     kind = "seeds" if seeds else study
@@ -198,96 +174,69 @@ def write_tables(preset: Preset, root: Path) -> None:
     Where the answers are not here, given on another machine, the row that is there is kept if it is of the same model.
     """
     write_main_table(preset, root)
-    for study in TABLES:
+    for study in (*TABLES, "sigma"):
         write_study_table(preset, root, study)
-    write_sigma_table(preset, root)
 
 
-def write_study_table(preset: Preset, root: Path, study: str, *, steps: int = 0) -> None:
-    """Write the table of a study of `TABLES`, by the rule of `write_tables`.
+def write_study_table(
+    preset: Preset, root: Path, study: str, *, values: Sequence[float] = (), steps: int = 0
+) -> None:  # fmt: skip
+    """Write {object: {row: errors, and under "run" the cost}} of a study where any is done, as `write_tables` does.
 
-    The models of other ``steps`` than the study's have a file of their own: robustness_300.json.
+    ``values`` are σ (px), besides the preset's, or seeds, besides those that are there. The models of other ``steps``
+    than the study's have a file of their own: robustness_300.json. Of those compared by seeds that the study of the
+    smaller budget has as well, its rows are taken where there are no others.
     """
-    models = {name: configure_study(preset, name, study, steps=steps) for name in OBJECTS}
-    _write_study(models, Paths(root, preset.name), f"{study}_{steps}" if steps else study)
+    paths, file = Paths(root, preset.name), f"{study}_{steps}.json" if steps else f"{study}.json"
+    stored, rows, varied = evaluation.read_results(paths.results / file, depth=2), {}, None
+    if study == "sigma":
+        varied = vary_sigma([*preset.sigmas_px, *values, *_read_keys(paths.results / file, stored, float)])
+    elif study == "seeds":
+        there = _read_keys(paths.results / file, stored, lambda key: int(key.rpartition("-")[2]))
+        varied = vary_seed([*values, *there])
+    others = evaluation.read_results(paths.results / "budget.json", depth=2) if study == "seeds" else {}
+    named = {row["run"].get("model"): row for shared in others.values() for row in shared.values() if "run" in row}
+    for name in OBJECTS:
+        for key, model in configure_study(preset, name, study, varied, steps=steps).items():
+            kept = get(stored, name, key) or named.get(model.name, {})
+            row, run = _find_row(paths, "", model, kept, kept.get("run", {}))
+            if row:
+                rows.setdefault(name, {})[key] = {**row, "run": run}
+    if rows or stored:
+        evaluation.write_results(rows, paths.results / file)
+
+
+def _read_keys(path: Path, stored: dict[str, dict], convert: Callable[[str], float]) -> list[float]:
+    """The numbers that a study's rows are called by; DamagedFileError where one is none."""
+    try:
+        return [convert(key) for rows in stored.values() for key in rows]
+    except ValueError as error:
+        raise DamagedFileError(f"{path} has a row of another study ({error}): restore it, or remove the row") from error
 
 
 def write_main_table(preset: Preset, root: Path) -> dict[str, dict[str, dict]]:
     """Write rmse.json and runs.json, by the rule of `write_tables`; returns the former, {object: {method: row}}."""
     paths = Paths(root, preset.name)
-    errors, costs = (read_results(paths.results / f"{name}.json", depth=n) for name, n in (("rmse", 2), ("runs", 1)))
+    errors = evaluation.read_results(paths.results / "rmse.json", depth=2)
+    costs = evaluation.read_results(paths.results / "runs.json")
     tables, runs = {name: {} for name in OBJECTS}, {}
     for name in OBJECTS:
         models = configure_study(preset, name, "main")
-        for method in (*models, *BASELINES, *CHANCE):
+        for method in (*models, *evaluation.BASELINES, *evaluation.CHANCE):
             key, stored = f"{name}-{method}", errors.get(name, {}).get(method, {})
             row, run = _find_row(paths, key, models.get(method), stored, costs.get(key, {}))
             tables[name] |= {method: row} if row else {}
             runs |= {key: run} if run else {}
-    write_results(runs, paths.results / "runs.json")
-    write_results(tables, paths.results / "rmse.json")
+    evaluation.write_results(runs, paths.results / "runs.json")
+    evaluation.write_results(tables, paths.results / "rmse.json")
     return tables
-
-
-def write_sigma_table(preset: Preset, root: Path, sigmas_px: Sequence[float] = (), *, steps: int = 0) -> None:
-    """Write sigma.json, by the rule of `write_tables`; ``sigmas_px`` besides the preset's and those that are there.
-
-    The models of other ``steps`` than the smaller budget's have a file of their own: sigma_4000.json.
-    """
-    steps = read_count("steps", steps)
-    paths, study = Paths(root, preset.name), f"sigma_{steps}" if steps else "sigma"
-    there = _read_keys(paths.results / f"{study}.json", float)
-    rows = vary_sigma([*preset.sigmas_px, *sigmas_px, *there])
-    _write_study({name: configure_study(preset, name, "sigma", rows, steps=steps) for name in OBJECTS}, paths, study)
-
-
-def write_seed_table(preset: Preset, root: Path, seeds: int = 0, *, steps: int = 0) -> None:
-    """Write seeds.json, by the rule of `write_tables`: of the seeds 0 to ``seeds`` - 1, and those that are there.
-
-    The models of other ``steps`` than the main table's have a file of their own: seeds_1000.json. Of those that the
-    study of the smaller budget has as well, its rows are taken where there are no others.
-    """
-    seeds, steps = read_count("seeds", seeds), read_count("steps", steps)
-    paths, study = Paths(root, preset.name), f"seeds_{steps}" if steps else "seeds"
-    there = _read_keys(paths.results / f"{study}.json", lambda key: int(key.rpartition("-")[2]))
-    rows = vary_seed([*range(seeds), *there])
-    models = {name: configure_study(preset, name, "seeds", rows, steps=steps) for name in OBJECTS}
-    _write_study(models, paths, study, beside="budget")
-
-
-def _read_keys(path: Path, convert: Callable[[str], float]) -> list[float]:
-    """The numbers that a study's rows are called by; DamagedFileError where one is none."""
-    try:
-        return [convert(key) for rows in read_results(path, depth=2).values() for key in rows]
-    except ValueError as error:
-        if isinstance(error, DamagedFileError):
-            raise
-        raise DamagedFileError(f"{path} has a row of another study ({error}): restore it, or remove the row") from error
-
-
-def _write_study(models: dict[str, dict[str, TrainConfig]], paths: Paths, study: str, *, beside: str = "") -> None:
-    """One file {object: {key: errors, and under "run" the cost}} of models under the same keys, where any is done.
-
-    A model's row that this file lacks is that of the same model in the file ``beside``.
-    """
-    stored, rows = read_results(paths.results / f"{study}.json", depth=2), {}
-    others = read_results(paths.results / f"{beside}.json", depth=2) if beside else {}
-    named = {row["run"].get("model"): row for shared in others.values() for row in shared.values() if "run" in row}
-    for name, keyed in models.items():
-        for key, model in keyed.items():
-            kept = stored.get(name, {}).get(key) or named.get(model.name, {})
-            row, run = _find_row(paths, "", model, kept, kept.get("run", {}))
-            if row:
-                rows.setdefault(name, {})[key] = {**row, "run": run}
-    if rows or stored:
-        write_results(rows, paths.results / f"{study}.json")
 
 
 def _find_row(paths: Paths, key: str, model: TrainConfig | None, row: dict, run: dict) -> tuple[dict, dict]:
     """Results and cost of a model, or of the baseline ``key``: those of its answers, or else what is stored."""
     out = paths.queries(model.name if model else key)
     if out.is_file():
-        return summarise({key: out})[key], describe_run(paths.model(model) / WEIGHTS) if model else {}
+        return evaluation.summarise({key: out})[key], describe_run(paths.model(model) / WEIGHTS) if model else {}
     return (row, run) if model is None or run.get("model") == model.name else ({}, {})
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from mmgsd.checks import check_choice
-from mmgsd.config import OBJECTS, ROUNDS, Preset, RenderConfig, TrainConfig
+from mmgsd.config import OBJECTS, ROUNDS, Preset, TrainConfig
 
 CHANCE_STYLES = {"centre": "--", "random": ":"}
 ABOVE = {"unimodal": (0, (4, 2)), "pcl": (0, (4, 2))}  # dashed, on the lines that they lie on: MMGSD's, SPCL's
@@ -141,8 +141,6 @@ MODELS = (
 UNTRAINED = (
     Model("sift", "SIFT", "", studies=("hand_made",), colour="#CC79A7"),
     Model("orb", "ORB", "", studies=("hand_made",), colour="#999933"),
-    Model("akaze", "AKAZE", "", studies=("hand_made",), colour="#332288"),
-    Model("daisy", "DAISY", "", studies=("hand_made",), colour="#E69F00"),
     Model("imagenet", "ImageNet features", "", studies=("hand_made",), colour="#117733"),
     Model("dinov2", "DINOv2 features", "", studies=("optional",), colour="#44AA99"),
     Model("random", "random points", "", studies=("chance",), short="Random points", colour="#9A9A9A"),
@@ -190,20 +188,12 @@ def configure_study(
     if rows is None:
         rows = vary_sigma(preset.sigmas_px) if study == "sigma" else list_rows(study)
     base = (preset.ablation if study in SMALL else preset.train)[object]
-    models = {row.name: _join_clutter(_configure(base, row), preset) for row in rows if object in row.objects}
+    models = {row.name: _configure(base, row) for row in rows if object in row.objects}
+    models = {name: dataclasses.replace(model, also=preset.cluttered) if model.also else model
+              for name, model in models.items()}  # fmt: skip
     kept = [row.name for row in rows
             if row.name in models and (row.scene or models[row.name] != models.get(row.start))]  # fmt: skip
     return {name: dataclasses.replace(models[name], steps=steps or models[name].steps) for name in kept}
-
-
-def _join_clutter(model: TrainConfig, preset: Preset) -> TrainConfig:
-    """What learns from cluttered images besides learns from those of the preset's size."""
-    return dataclasses.replace(model, also=preset.cluttered) if model.also else model
-
-
-def configure_scene(preset: Preset, object: str, row: Model) -> RenderConfig:
-    """The images of an object that a row's model is trained on."""
-    return dataclasses.replace(preset.render[object], **row.scene)
 
 
 def _configure(base: TrainConfig, row: Model) -> TrainConfig:

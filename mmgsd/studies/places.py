@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +11,9 @@ from scipy.signal import find_peaks
 from mmgsd.config import N_POINTS, OBJECTS
 from mmgsd.measure.metrics import BIN_PX
 from mmgsd.measure.regions import find_regions
-from mmgsd.studies import figure_data, main
-from mmgsd.studies.claims import Claim, get, get_regions, is_better, list_errors
+from mmgsd.studies import main
+from mmgsd.studies.claims import Claim, get, get_regions, hold_all, is_better, list_errors
+from mmgsd.studies.figure_data import FigureData, load_figure_data
 from mmgsd.studies.registry import Results, Shown, Study
 from mmgsd.studies.table import Column, Table
 
@@ -24,22 +24,20 @@ COMMAND = "`04_evaluate`, `07_figures`"
 
 def measure_all(folder: Path, found: Results | None = None) -> dict[str, Any]:
     """``places``, ``peaks`` {object: `measure_places`, `count_peaks`} of a preset's data of figures, where it is."""
-    drawn = {name: path for name, path in main.list_drawn(folder).items() if path.is_file()}
-    places = {name: measure_places(path, name) for name, path in drawn.items()}
-    return {"places": places, "peaks": {n: count_peaks(path) for n, path in drawn.items()}} if drawn else {}
+    drawn = {name: load_figure_data(path) for name, path in main.list_drawn(folder).items() if path.is_file()}
+    places = {name: measure_places(data, name) for name, data in drawn.items()}
+    return {"places": places, "peaks": {name: count_peaks(data) for name, data in drawn.items()}} if drawn else {}
 
 
-def count_peaks(path: Path) -> int:
+def count_peaks(data: FigureData) -> int:
     """How many peaks the distribution of MMGSD's error has, as it is drawn (`mmgsd.studies.main.plot_rmse_pdf`)."""
-    data = figure_data.load_figure_data(path)
     _, density = main.compute_density(data.errors["mmgsd"].histogram, 100 * BIN_PX / data.object_size_px)
     return len(find_peaks(np.pad(density, 1), prominence=PEAK * density.max())[0])
 
 
-def measure_places(path: Path, name: str) -> dict[str, float]:
+def measure_places(data: FigureData, name: str) -> dict[str, float]:
     """MMGSD's mean error (px) by place on the object: ``corner``, ``edge``, ``interior``, or ``end``, ``middle``."""
-    errors = figure_data.load_figure_data(path).errors["mmgsd"]
-    from_middle = np.abs(np.arange(N_POINTS) / (N_POINTS - 1) - 0.5)
+    errors, from_middle = data.errors["mmgsd"], np.abs(np.arange(N_POINTS) / (N_POINTS - 1) - 0.5)
     along = {"end": from_middle > 0.5 - ENDS, "middle": from_middle < ENDS}
     places = find_regions() if name == "cloth" else along
     mean, asked = np.nan_to_num(errors.mean_px), errors.asked
@@ -57,19 +55,13 @@ def judge_interior(results: Results) -> Claim:
     """Where on the objects the errors lie; for the cloth, where not measured by place, the study's model of c4."""
     cloth = get(results, "places", "cloth") or get_regions(results, "c4", "rmse_px")
     rope = get(results, "places", "rope") or {}
-    parts = (_is_greatest(cloth, "interior", ("corner", "edge")), is_better(rope.get("end"), rope.get("middle")))
+    lower = [is_better(cloth.get(place), cloth.get("interior")) for place in ("corner", "edge")]
+    parts = (hold_all(lower), is_better(rope.get("end"), rope.get("middle")))
     return Claim(
         "interior", "Errors are highest in the object's interior and low at its extremities.",
         "MMGSD's error inside is larger than at corners and edges (cloth), or than at the ends (rope); a part each.",
         f"cloth: {list_errors(cloth)}; rope: {list_errors(rope)}; one seed", parts, COMMAND, ("mmgsd",),
     )  # fmt: skip
-
-
-def _is_greatest(errors: Mapping[str, float | None], place: str, others: Sequence[str]) -> bool | None:
-    lower = [is_better(errors.get(other), errors.get(place)) for other in others]
-    if False in lower:
-        return False
-    return None if None in lower else True
 
 
 def judge_bimodal(results: Results) -> Claim:

@@ -50,7 +50,6 @@ POLICIES = {
         Policy("mmgsd_joint", "MMGSD, surest joint answer", "#F0A070", "", JOINT),
         Policy("mmgsd_best", "MMGSD, each pixel's surest", "#A6761D", "", BEST),
         Policy("spcl", "SPCL, modes that agree", "#0072B2", "-spcl", AGREE),
-        Policy("daisy", "DAISY, modes that agree", "#E69F00", "daisy", AGREE),
         Policy("sift", "SIFT, modes that agree", "#CC79A7", "sift", AGREE),
         *(Policy(f"quick_{name}", f"{label}, as `{TRAINED_BY}` trains it", get_colour(name), "", AGREE, name)
           for name, label in (("mmgsd", "MMGSD"), ("spcl", "SPCL"), ("unimodal", "Unimodal"), ("pcl", "PCL"))),

@@ -77,10 +77,6 @@ class Finding:
     count: Callable[[Results], Mapping[str, str]]  # the numbers that the sentence leaves open
 
 
-def check_nothing(paths: Paths, **options: Any) -> None:
-    """What a study checks before it is run that needs nothing."""
-
-
 @dataclass(frozen=True)
 class Study:
     """One study, in all of its parts; a part that it lacks is left out.
@@ -92,7 +88,7 @@ class Study:
     name: str
     place: int  # among the studies, in the order of the table of claims
     run: Callable[..., Path]
-    check: Callable[..., None] = check_nothing
+    check: Callable[..., None] = lambda paths, **options: None
     notebook: str = ""  # that shows it
     results: Sequence[str] = ()  # names of its results files
     shows: Callable[..., Sequence[Path]] | None = None  # files of the preset that it shows; default: the first result
@@ -202,12 +198,12 @@ def save_figures(figures: Mapping[str, Figure | None], folder: Path) -> pd.DataF
     return pd.Series([path.name for path in saved], name="file").to_frame()
 
 
-def run_study(name: str, preset: str, *, root: Path | None = None, **options: Any) -> Path:
-    """Run a study of a preset, below the repository's root unless another is given; the results file.
+def run_study(name: str, preset: str, **options: Any) -> Path:
+    """Run a study of a preset; the results file.
 
     ValueError for an unknown study or preset, and where something has to be made first.
     """
-    study, paths = get_study(name), Paths(root or find_root(), load_preset(preset).name)
+    study, paths = get_study(name), Paths(find_root(), load_preset(preset).name)
     study.check(paths, **options)
     return study.run(paths, **options)
 

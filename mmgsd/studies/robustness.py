@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mmgsd.config import OBJECTS, load_preset
-from mmgsd.figures.style import PAGE_IN, check_filled, finish_axes, styled
+from mmgsd.figures.style import PAGE_IN, finish_axes, styled
 from mmgsd.match.baselines import BASELINES, OPTIONAL
 from mmgsd.studies.matrix import run_matrix
 from mmgsd.studies.models import get_colour, get_label, list_rows
@@ -46,31 +46,24 @@ def make_budget_sentence(rows: Rows) -> str:
 
 @styled
 def plot_robustness(rows: Rows) -> Figure:
-    """A panel for clean renders, cluttered ones and photographs: a bar for each model and baseline of each object.
-
-    ``rows`` as `mmgsd.studies.shipped` stores them; what was not measured says so. ValueError of no row.
-    """
-    check_filled("rows", rows)
+    """A panel for clean renders, cluttered ones and photographs: a bar for each model and baseline of each object."""
     names = [name for object in OBJECTS for name in list_names(rows, object)]
+    places = [place + 0.6 * (not name.startswith(OBJECTS[0])) for place, name in enumerate(names)]
     size = PAGE_IN, 0.5 + 0.17 * len(names)
     figure, axes = plt.subplots(1, len(PANELS), figsize=size, layout="constrained", sharey=True)
     for axis, (title, part, key, scale, unit) in zip(axes, PANELS, strict=True):
-        for place, name in enumerate(names):
+        for place, name in zip(places, names, strict=True):
             value = (get_photographs(rows, name) if part == "photographs" else rows[name].get(part, {})).get(key)
-            _draw_bar(axis, place + 0.6 * (not name.startswith(OBJECTS[0])), name, value and scale * value)
+            _draw_bar(axis, place, name, value and scale * value)
         axis.set(title=title, xlabel=unit)
     widest = 1.12 * max(1.0, *(axis.dataLim.x1 for axis in axes[:2]))
     for axis, most in zip(axes, (widest, widest, 100), strict=True):
         axis.set_xlim(0, most)
-    places = [place + 0.6 * (not name.startswith(OBJECTS[0])) for place, name in enumerate(names)]
-    axes[0].set_yticks(places, [_label(name) for name in names])
+    kinds = [name.partition("@")[0].partition("-") for name in names]
+    labels = [f"{object.capitalize()}: {LABELS.get(kind) or get_label(kind)}" for object, _, kind in kinds]
+    axes[0].set_yticks(places, labels)
     axes[0].invert_yaxis()
     return finish_axes(figure)
-
-
-def _label(name: str) -> str:
-    object, _, kind = name.partition("@")[0].partition("-")
-    return f"{object.capitalize()}: {LABELS.get(kind) or get_label(kind)}"
 
 
 def _draw_bar(axis: Axes, place: float, name: str, value: float | None) -> None:

@@ -28,11 +28,10 @@ def load_shipped(object: str, method: str = "mmgsd") -> Matcher:
     return load(f"{object}{SHIPPED[method]}")
 
 
-def ask_sample(matcher: Matcher, data: Dataset, *, group: str = "", modes: int = 0) -> pd.DataFrame:
+def ask_sample(matcher: Matcher, data: Dataset, *, group: str = "") -> pd.DataFrame:
     """A model's answers about `load_sample`'s images, a row a query as in `mmgsd.measure.evaluation.load_queries`.
 
-    The true matches are those of ``group`` ("" is what the model was taught); as many modes are fitted as a query has
-    true matches, but at least ``modes``, of which the most probable are the answer.
+    The true matches are those of ``group`` ("" is what the model was taught).
     """
     answer = model_answer(matcher, data, QUESTIONS)
-    return ask(answer, data, QUESTIONS, group or matcher.config.group, False, "", modes)
+    return ask(answer, data, QUESTIONS, group or matcher.config.group, False, "")

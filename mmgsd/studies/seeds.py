@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import statistics
-from pathlib import Path
+from functools import partial
 
 from scipy import stats
 
 from mmgsd.config import OBJECTS
-from mmgsd.paths import Paths
 from mmgsd.studies.claims import Claim, get, list_errors
 from mmgsd.studies.matrix import ALL, run_matrix
 from mmgsd.studies.registry import Finding, Results, Shown, Study
@@ -16,11 +15,6 @@ from mmgsd.studies.table import LABELS, Table, describe_objects
 
 SEEDS = 3  # from which a spread over seeds is spoken of
 LEVEL = 0.05  # of p, from which seeds do not tell two methods apart
-
-
-def run(paths: Paths, *, seeds: int = SEEDS, steps: int = 0, scheduler: str = "") -> Path:
-    """Train and ask the models compared by seeds, with ``seeds`` each; 0 ``steps`` are the main table's."""
-    return run_matrix(paths, seeds=seeds, steps=steps, scheduler=scheduler)
 
 
 def list_seeds(rows: Results, method: str) -> list[float]:
@@ -106,7 +100,7 @@ def count_findings(results: Results) -> dict[str, str]:
 
 
 STUDY = Study(
-    "seeds", 30, run, results=("seeds_1000",),
+    "seeds", 30, partial(run_matrix, seeds=SEEDS), results=("seeds_1000",),
     tables={
         "seeds_1000": Shown("paper/seeds_1000.json", describe_seeds),
         "first_seed": Shown("paper/seeds_1000.json", make_first_seed_sentence),

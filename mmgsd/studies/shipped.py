@@ -1,6 +1,6 @@
 """What shipped weights, and what one would pick instead, do on clean renders, on cluttered ones and on photographs.
 
-    python -m mmgsd run shipped cloth cloth-paper daisy --photographs FOLDER    -> data/results/shipped.json
+    python -m mmgsd run shipped cloth cloth-paper orb --photographs FOLDER    -> data/results/shipped.json
     python -m mmgsd run shipped cloth@1,1 --photographs FOLDER     its modes read with another power and sharpness
     python -m mmgsd run shipped robustness --photographs FOLDER    the models of that study, once they are trained
     python -m mmgsd run shipped cloth --cloth-renders FOLDER       and others' renders of a cloth
@@ -44,10 +44,6 @@ Rows = Mapping[str, Mapping[str, Any]]  # data/results/shipped.json, {name: what
 SETS = {"paper": "clean", "workspace": "cluttered"}  # test images: what readers know them as
 SIDES = {"cloth": "side", "rope": "length"}  # of what an error is a share
 READING = ("power", "sharpness")
-SOURCES = """\
-The photographs, counted as on the
-[results page](data/results/README.md#is-it-right-about-clutter-and-photographs), are from {sources}."""
-COUNTS = "Photographs: {counts}. One question about two new images takes {slowest:.0f} ms ({hardware})."
 
 
 def list_names(rows: Rows, object: str) -> list[str]:
@@ -179,7 +175,9 @@ def describe_knowledge(rows: Rows) -> Table:
 def make_sources_sentence(rows: Rows) -> str:
     """What is counted in photographs, and which public repositories they are from."""
     sources = dict.fromkeys(name for object in OBJECTS for name in rows[object]["photographs"]["sources"])
-    return SOURCES.format(sources=", ".join(f"`{name}`" for name in sources))
+    return ("The photographs, counted as on the\n"
+            "[results page](data/results/README.md#is-it-right-about-clutter-and-photographs), are from "
+            f"{', '.join(f'`{name}`' for name in sources)}.")  # fmt: skip
 
 
 def describe_sources(rows: Rows) -> Table:
@@ -197,7 +195,8 @@ def make_counts_sentence(rows: Rows) -> str:
     """How many photographs were asked about, and how long a question takes."""
     counts = " and ".join(f"{rows[object]['photographs']['photographs']} of {object}s" for object in OBJECTS)
     slowest = max(OBJECTS, key=lambda object: rows[object]["milliseconds"])
-    return COUNTS.format(counts=counts, slowest=rows[slowest]["milliseconds"], hardware=rows[slowest]["hardware"])
+    took, hardware = rows[slowest]["milliseconds"], rows[slowest]["hardware"]
+    return f"Photographs: {counts}. One question about two new images takes {took:.0f} ms ({hardware})."
 
 
 def read_reliability(rows: Rows, kind: str) -> dict[str, pd.DataFrame]:
@@ -206,17 +205,10 @@ def read_reliability(rows: Rows, kind: str) -> dict[str, pd.DataFrame]:
 
 
 def measure_study(
-    study: str,
-    root: Path,
-    preset: Preset,
-    *,
-    objects: Sequence[str] = (),
-    steps: int = 0,
+    study: str, root: Path, preset: Preset, *, objects: Sequence[str] = (), steps: int = 0,
     photographs: Path | None = None,
-) -> dict[str, dict[str, Any]]:
-    """The rows of a study's models, those of some ``objects`` where they are named.
-
-    {object-row: as `measure_weights`, with the preset and the ``steps`` of each}.
+) -> dict[str, dict[str, Any]]:  # fmt: skip
+    """{object-row: as `measure_weights`, with preset and ``steps``} of a study's models, all or of some objects.
 
     FileNotFoundError where one is not trained yet.
     """
@@ -239,8 +231,8 @@ def measure_rows(
 ) -> dict[str, dict[str, Any]]:  # fmt: skip
     """The rows of a name that is asked for, as the module says."""
     if name in STUDIES:
-        how = {"objects": (object,) if object else (), "steps": steps, "photographs": photographs}
-        return measure_study(name, root, load_preset(preset), **how)
+        objects = (object,) if object else ()
+        return measure_study(name, root, load_preset(preset), objects=objects, steps=steps, photographs=photographs)
     how = {"photographs": photographs, "presets": () if photographs_alone else measured.SETS}
     if name in (*BASELINES, *OPTIONAL):
         rows = {f"{object}-{name}": measure_baseline(name, object, root, **how) for object in OBJECTS}

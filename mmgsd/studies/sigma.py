@@ -13,11 +13,11 @@ from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 
 from mmgsd.config import OBJECTS, TrainConfig, load_preset
-from mmgsd.figures.style import COLUMN_IN, check_filled, finish_axes, styled
+from mmgsd.figures.style import COLUMN_IN, finish_axes, styled
 from mmgsd.measure.evaluation import read_results
 from mmgsd.paths import Paths
 from mmgsd.studies.claims import Claim, get, is_better, say
-from mmgsd.studies.matrix import run_each, train_and_ask, write_sigma_table
+from mmgsd.studies.matrix import run_each, train_and_ask, write_study_table
 from mmgsd.studies.models import configure_study, get_colour, vary_sigma
 from mmgsd.studies.parameters import check_training
 from mmgsd.studies.registry import ERROR_MEASURES, Results, Shown, Study
@@ -42,7 +42,7 @@ def run(paths: Paths, *, sigmas_px: Sequence[float] = (), steps: int = 0, overwr
     """Train and ask each model; sigma.json, or of other ``steps`` sigma_4000.json."""
     models = {model.name: model for model in list_models(paths.preset, sigmas_px, steps=steps)}
     dict(run_each(partial(train_and_ask, paths=paths, overwrite=overwrite), models, desc="models"))
-    write_sigma_table(load_preset(paths.preset), paths.root, sigmas_px, steps=steps)
+    write_study_table(load_preset(paths.preset), paths.root, "sigma", values=sigmas_px, steps=steps)
     return list_shown(paths, steps=steps)[0]
 
 
@@ -96,8 +96,6 @@ def plot_sigma_ablation(
 
     Rings at σ = 1 px are ``seeds`` {object: {"mmgsd-1": {metric: value}}} of the same training, but for the seed 0.
     """
-    for name, rows in {"": results, **results}.items():
-        check_filled(f"results[{name!r}]" if name else "results", rows)
     figure, axes = plt.subplots(1, len(results), figsize=(COLUMN_IN, 1.7), layout="constrained", squeeze=False)
     for axis, (name, rows) in zip(axes[0], results.items(), strict=True):
         points = sorted((float(sigma), metrics["rmse_mean"]) for sigma, metrics in rows.items())

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from scipy.stats import spearmanr
 
 from mmgsd.config import TrainConfig, load_preset
-from mmgsd.figures.style import PAGE_IN, check_filled, finish_axes, name_grid, save_figure, styled
+from mmgsd.figures.style import PAGE_IN, finish_axes, name_grid, save_figure, styled
 from mmgsd.measure.evaluation import load_queries, read_results, summarise, write_results
 from mmgsd.measure.regions import MAP, SIDE, measure_rings, summarise_places
 from mmgsd.model.tensors import describe_run
@@ -74,7 +74,8 @@ def describe_symmetry(results: Results) -> Table:
 def judge_group(results: Results) -> Claim:
     """This project's own conjecture about the paper's error map, in which the error grows inwards."""
     rings = {group: get(results, "symmetry", group, "rings") for group in ("v4", "c4")}
-    inwards = {group: None if row is None else rank_inwards(row) for group, row in rings.items()}
+    inwards = {group: None if row is None else float(spearmanr(range(len(row) - 1), row[:-1]).statistic)
+               for group, row in rings.items()}  # fmt: skip  # without the centre, which is one point
     known = None not in inwards.values()
     shown = [f"`{group}`: {say(row[0])} … {say(row[-2])} px, rank correlation {say(inwards[group], 'share')}"
              for group, row in rings.items() if row]  # fmt: skip
@@ -84,11 +85,6 @@ def judge_group(results: Results) -> Claim:
         "and not under `c4`.", f"rings, outermost … next to the centre, {'; '.join(shown) or '–'}; one seed",
         (inwards["v4"] >= RANKED > inwards["c4"] if known else None,), runs="symmetry",
     )  # fmt: skip
-
-
-def rank_inwards(rings: Sequence[float]) -> float:
-    """Rank correlation of errors by ring, outermost first, with the ring; the centre, one point, is left out."""
-    return float(spearmanr(range(len(rings) - 1), rings[:-1]).statistic)
 
 
 def draw_symmetry(folder: Path) -> Figure | None:
@@ -103,7 +99,6 @@ def plot_symmetry_study(places: Mapping[str, Mapping[str, Any]]) -> Figure:
 
     ``places`` {group: what `mmgsd.measure.regions.summarise_places` gives}.
     """
-    check_filled("places", places)
     ratios = [1.0] * len(places) + [1.4, 1.4]
     figure, axes = plt.subplots(1, len(ratios), figsize=(PAGE_IN, 1.9), layout="constrained", width_ratios=ratios)
     maps = [np.array(row[MAP], float).reshape(SIDE, SIDE) for row in places.values()]

@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -23,17 +23,20 @@ from matplotlib.figure import Figure
 from mmgsd.checks import check_choice
 from mmgsd.command import Option
 from mmgsd.config import DEFAULT_GROUP, IMAGE_SIZE, OBJECTS
-from mmgsd.figures.style import PAGE_IN, check_filled, finish_axes, save_figure, styled
-from mmgsd.files import DamagedFileError, quarantine, read_json, write_json
+from mmgsd.figures.style import PAGE_IN, finish_axes, save_figure, styled
+from mmgsd.files import write_json
 from mmgsd.fold.jobs import film_job, run_jobs, true_moves
 from mmgsd.fold.state import State, read_state
 from mmgsd.fold.tasks import GROUNDS, MOTIONS, TASKS, find_task
+from mmgsd.match import matcher
 from mmgsd.match.match import LIKELY
-from mmgsd.match.matcher import Matcher, find_weights
+from mmgsd.match.matcher import find_weights
 from mmgsd.measure.tracking import Truth, average_tracks, measure_track
 from mmgsd.paths import Paths, find_root
 from mmgsd.progress import ProgressBar
-from mmgsd.studies.folding import Bench, Rollout
+from mmgsd.studies.folding import Bench, Rollout, read_kept
+from mmgsd.studies.registry import Results, Shown, Study
+from mmgsd.studies.table import Column, Table
 from mmgsd.symmetry import load_group
 
 VERSION = 1  # to be raised where a method answers the same film otherwise than before
@@ -42,9 +45,13 @@ FRAMES, SCALE = 32, 1.0  # of a film; of its sides, by those of a rendered data 
 POINTS = {"cloth": [25 * r + c for r in range(0, 25, 6) for c in range(0, 25, 6)],
           "rope": list(range(0, 625, 26))}  # fmt: skip
 CONSISTENT_PX = 2.0  # a point that flow takes there and back to so near is seen
+COLUMNS = [Column("delta", page="δ_avg", scale=100), Column("swaps", page="swaps", scale=100),
+           Column("occlusion", page="occlusion", scale=100), Column("jaccard", page="Jaccard", scale=100)]  # fmt: skip
 
 Answer = tuple[np.ndarray, np.ndarray]  # (T, S, 2) px, and (T, S) bool, whether the point is seen
 Follow = Callable[[str, np.ndarray, np.ndarray], Answer]  # of an object's frames (T, H, W, 3) and first pixels (S, 2)
+
+load = cache(matcher.load)  # the shipped weights of an object
 
 
 @dataclass(frozen=True)
@@ -63,17 +70,8 @@ def track(object: str, frames: np.ndarray, xy: np.ndarray) -> Answer:
     return found.xy, found.visible > LIKELY
 
 
-def match_alone(object: str, frames: np.ndarray, xy: np.ndarray) -> Answer:
-    """Each frame's most probable mode."""
-    return _match_each(object, frames, xy, nearest=False)
-
-
-def match_nearest(object: str, frames: np.ndarray, xy: np.ndarray) -> Answer:
-    """Of each frame's modes the one nearest to the last one's, each point by itself."""
-    return _match_each(object, frames, xy, nearest=True)
-
-
-def _match_each(object: str, frames: np.ndarray, xy: np.ndarray, *, nearest: bool) -> Answer:
+def match_each(object: str, frames: np.ndarray, xy: np.ndarray, *, nearest: bool) -> Answer:
+    """Each frame's most probable mode, or the one ``nearest`` to the last frame's, each point by itself."""
     places, seen, rows = [xy], [np.ones(len(xy), bool)], np.arange(len(xy))
     for match in load(object).match_many((frames[0], frame, xy) for frame in frames[1:]):
         distance = np.nan_to_num(np.linalg.norm(match.modes - places[-1][:, None], axis=-1), nan=np.inf)
@@ -120,21 +118,15 @@ def _chain(frames: np.ndarray, xy: np.ndarray, step: Callable[..., tuple[np.ndar
 
 METHODS = {
     "track": Method("MMGSD, tracked", "#D55E00", track),
-    "nearest": Method("MMGSD, mode nearest to the last", "#F0A070", match_nearest),
-    "alone": Method("MMGSD, most probable mode", "#A6761D", match_alone),
+    "nearest": Method("MMGSD, mode nearest to the last", "#F0A070", partial(match_each, nearest=True)),
+    "alone": Method("MMGSD, most probable mode", "#A6761D", partial(match_each, nearest=False)),
     "lucas_kanade": Method("Lucas–Kanade, chained", "#0072B2", flow_lucas_kanade, learnt=False),
     "dis": Method("DIS flow, chained", "#009E73", flow_dis, learnt=False),
 }
 
 
-@cache
-def load(object: str) -> Matcher:
-    """The shipped weights of an object."""
-    return Matcher.load(find_weights(object))
-
-
 def run(
-    preset: str, root: Path, *, count: int = 0, frames: int = FRAMES, scale: float = SCALE, workers: int = 0,
+    paths: Paths, *, count: int = 0, frames: int = FRAMES, scale: float = SCALE, workers: int = 0,
     progress: bool = True,
 ) -> Path:  # fmt: skip
     """Follow points through the films of a preset and write what is measured, and its figure; the results' path.
@@ -142,11 +134,10 @@ def run(
     ``count`` films of each object (0: the preset's), of so many ``frames`` whose sides are ``scale`` times the data
     set's; ``workers`` child processes render at once (0: one a core). ValueError for another preset.
     """
-    check_choice("preset", preset, tuple(FILMS))
-    paths, count = Paths(root, preset), count or FILMS[preset]
+    check_choice("preset", paths.preset, tuple(FILMS))
+    count, how = count or FILMS[paths.preset], {"workers": workers, "progress": progress}
     results: dict[str, Any] = {"run": {"films": count, "frames": frames, "scale": scale}, "methods": {}}
     for object in OBJECTS:
-        how = {"workers": workers, "progress": progress}
         films = make_films(object, Bench(paths.generated / "folding", how), count, frames, scale)
         asked = [(name, film) for name in METHODS for film in films]
         bar = ProgressBar(asked, desc=f"track, {object}", unit="film", disable=not progress)
@@ -154,7 +145,7 @@ def run(
                     for name, film in bar}  # fmt: skip
         results["methods"][object] = {name: summarise({film: measured[name, film] for film in films})
                                       for name in METHODS}  # fmt: skip
-    save_figure(figure(results), paths.figures / "tracking", kinds=("png",))
+    save_figure(plot_tracking(results), paths.figures / "tracking", kinds=("png",))
     return write_json(paths.results / "tracking.json", results)
 
 
@@ -186,18 +177,13 @@ def measure_film(name: str, file: Path, out: Path) -> dict[str, float]:
     film, method = read_state(file), METHODS[name]
     weights = find_weights(film.about["object"]).read_bytes() if method.learnt else b""
     mark = {"film": film.about["mark"], "weights": hashlib.sha256(weights).hexdigest(), "version": VERSION}
-    if out.is_file():
-        try:
-            kept = read_json(out)
-            if kept["mark"] == mark:
-                return kept["measured"]
-        except (DamagedFileError, KeyError, TypeError):
-            quarantine(out)
-    points, truth = find_truth(film)
-    xy, seen = method.follow(film.about["object"], film.image, film.xy[0, points])
-    measured = measure_track(np.asarray(xy, float), seen, truth)
-    write_json(out, {"mark": mark, "measured": measured})
-    return measured
+    kept = read_kept(out, mark)
+    if kept is None:
+        points, truth = find_truth(film)
+        xy, seen = method.follow(film.about["object"], film.image, film.xy[0, points])
+        kept = {"mark": mark, "measured": measure_track(np.asarray(xy, float), seen, truth)}
+        write_json(out, kept)
+    return kept["measured"]
 
 
 def find_truth(film: State) -> tuple[np.ndarray, Truth]:
@@ -216,19 +202,14 @@ def summarise(measured: Mapping[str, dict[str, float]]) -> dict[str, dict[str, f
     return {kind: average_tracks(rows) | {"films": len(rows)} for kind, rows in groups.items() if rows}
 
 
-def table(results: Mapping[str, Any]) -> str:
-    """Markdown, a row a method: δ_avg, identity swaps, occlusion accuracy and average Jaccard of each object."""
-    heads = [f"{object}: {head}" if head == "δ_avg" else head for object in OBJECTS
-             for head in ("δ_avg", "swaps", "occlusion", "Jaccard")]  # fmt: skip
-    lines = [f"|  | {' | '.join(heads)} |", "|---" * (len(heads) + 1) + "|"]
-    for name, method in METHODS.items():
-        rows = [results["methods"][object][name]["all"] for object in OBJECTS]
-        shares = [row[key] for row in rows for key in ("delta", "swaps", "occlusion", "jaccard")]
-        lines.append(f"| {method.label} | {' | '.join(f'{100 * share:.1f} %' for share in shares)} |")
-    return "\n".join(lines)
+def describe_tracking(results: Results) -> Table:
+    """δ_avg, identity swaps, occlusion accuracy and average Jaccard of each method, on both objects."""
+    rows = {method.label: {object: results["methods"][object][name]["all"] for object in OBJECTS}
+            for name, method in METHODS.items()}  # fmt: skip
+    return Table(" ", {"": COLUMNS}, rows, OBJECTS)
 
 
-def sentence(results: Mapping[str, Any]) -> str:
+def make_films_sentence(results: Results) -> str:
     """What was measured, for beside the table."""
     counts = [f"{results['methods'][object]['track']['all']['films']} films of a {object}" for object in OBJECTS]
     return (f"{' and '.join(counts)}, {results['run']['frames']} frames each: folds, half turns, grippers in front, a "
@@ -237,9 +218,8 @@ def sentence(results: Mapping[str, Any]) -> str:
 
 
 @styled
-def figure(results: Mapping[str, Any]) -> Figure:
-    """δ_avg and swaps of each method, a panel each, by object. ValueError where no object was measured."""
-    check_filled("results", results["methods"])
+def plot_tracking(results: Results) -> Figure:
+    """δ_avg and swaps of each method, a panel each, by object."""
     panels = {"delta": "δ_avg (%)", "swaps": "Identity swaps (%)"}
     drawn, axes = plt.subplots(1, 2, figsize=(PAGE_IN, 0.7 + 0.35 * len(METHODS)), layout="constrained", sharey=True)
     for axis, (key, label) in zip(axes, panels.items(), strict=True):
@@ -254,6 +234,15 @@ def figure(results: Mapping[str, Any]) -> Figure:
     return finish_axes(drawn)
 
 
+STUDY = Study(
+    "tracking", 150, run, results=("tracking",),
+    tables={
+        "tracking": Shown("paper/tracking.json", describe_tracking),
+        "films": Shown("paper/tracking.json", make_films_sentence),
+    },
+)  # fmt: skip
+
+
 def main(
     preset: Annotated[str, Option(choices=tuple(FILMS))],
     *,
@@ -263,4 +252,4 @@ def main(
     workers: Annotated[int, Option("child processes at once (default: one a core)")] = 0,
 ) -> None:
     """Follow points through the films of a preset."""
-    print(run(preset, root=find_root(), count=count, frames=frames, scale=scale, workers=workers))
+    print(run(Paths(find_root(), preset), count=count, frames=frames, scale=scale, workers=workers))

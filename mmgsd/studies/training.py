@@ -12,7 +12,7 @@ from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 
 from mmgsd.config import METHODS, OBJECTS, Preset, TrainConfig, load_preset
-from mmgsd.figures.style import PAGE_IN, check_filled, finish_axes, styled
+from mmgsd.figures.style import PAGE_IN, finish_axes, styled
 from mmgsd.learn.checkpoints import LOG
 from mmgsd.learn.training import train_model
 from mmgsd.match.matcher import Matcher
@@ -96,13 +96,12 @@ def describe_runs(results: Results) -> Table:
 
 
 @styled
-def plot_training(logs: Mapping[str, pd.DataFrame], *, columns: int = 4) -> Figure:
+def plot_training(logs: Mapping[str, pd.DataFrame]) -> Figure:
     """Loss against step, a panel a model: ``logs`` {"cloth mmgsd": columns step, loss, seconds}, last word the method.
 
     Losses of different methods have different scales. Dark: mean of a tenth of the steps.
     """
-    check_filled("logs", logs)
-    columns = min(columns, len(logs))
+    columns = min(4, len(logs))
     rows = -(-len(logs) // columns)
     figure, axes = plt.subplots(rows, columns, figsize=(PAGE_IN * columns / 4, 1.5 * rows), layout="constrained",
                                 squeeze=False)  # fmt: skip

@@ -12,19 +12,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mmgsd.config import METHODS, OBJECTS, TrainConfig, load_preset
-from mmgsd.figures.style import COLUMN_IN, add_legend, check_filled, finish_axes, save_figure, styled
+from mmgsd.figures.style import COLUMN_IN, add_legend, finish_axes, save_figure, styled
 from mmgsd.match.matcher import find_weights
+from mmgsd.measure import uncertainty as measured
 from mmgsd.measure.evaluation import BASELINES, check_same_questions, evaluate_model, load_queries, write_results
-from mmgsd.measure.uncertainty import (
-    LEVELS,
-    compute_coverage,
-    compute_risk_coverage,
-    get_distances,
-    summarise_uncertainty,
-)
 from mmgsd.model.tensors import WEIGHTS, load_metadata
 from mmgsd.paths import Paths
-from mmgsd.studies.claims import NATS, RANKED, Claim, get, get_regions, is_above, is_at_least, say
+from mmgsd.studies.claims import NATS, RANKED, Claim, get, get_regions, hold_all, is_above, is_at_least, say
 from mmgsd.studies.models import CHANCE_STYLES, SHIPPED, configure_model, get_line_style
 from mmgsd.studies.parameters import check_images, check_made
 from mmgsd.studies.registry import Experiment, Finding, Measure, Results, Shown, Study
@@ -84,7 +78,8 @@ def run(paths: Paths, *, classical: Sequence[str] = ("sift", "orb"), overwrite: 
               for name, methods in after.items()}  # fmt: skip
     for name, methods in tables.items():
         check_same_questions(methods | {f"{m}, uncalibrated": table for m, table in before[name].items()})
-    summary = {when: {o: {m: summarise_uncertainty(t) for m, t in methods.items()} for o, methods in asked.items()}
+    summary = {when: {name: {m: measured.summarise_uncertainty(table) for m, table in methods.items()}
+                      for name, methods in asked.items()}
                for when, asked in {"calibrated": tables, "temperature 1": before}.items()}  # fmt: skip
     file = write_results(summary, paths.results / "uncertainty.json")
     shown = {o: {m: t for m, t in ts.items() if m in (*METHODS, *classical)} for o, ts in tables.items()}
@@ -150,8 +145,7 @@ def judge_inward(results: Results) -> Claim:
     """Where the uncertainty lies, as the symmetry study's model of c4 has it."""
     nats = get_regions(results, "c4", "entropy")
     corner, edge, interior = (nats.get(region) for region in ("corner", "edge", "interior"))
-    above = is_above(edge, corner), is_above(interior, corner)
-    least = False if False in above else None if None in above else True
+    least = hold_all([is_above(edge, corner), is_above(interior, corner)])
     shown = ", ".join(f"{region} {say(value, 'share')}" for region, value in nats.items())
     return Claim(
         "inward", "Uncertainty is least at the extremities and grows inwards.",
@@ -172,9 +166,9 @@ def plot_risk_coverage(queries: Tables) -> Figure:
     """Mean error of the queries kept against their share, least entropy first; dashed: MMGSD ordered by its errors.
 
     ``queries`` {object: {method: table}}, a panel an object, a line a method; chance, which is never certain, is left
-    out, as are queries with a hidden source. ValueError where there are none.
+    out, as are queries with a hidden source.
     """
-    figure, axes = _make_panels("queries", queries)
+    figure, axes = _make_row(len(queries))
     for axis, (name, methods) in zip(axes, queries.items(), strict=True):
         for method in _sort_methods(methods):
             seen = methods[method][methods[method].visible]
@@ -193,13 +187,10 @@ def plot_calibration(before: Tables, after: Tables) -> Figure:
     """Share of true matches inside the ellipses against the share that they promise; grey: perfectly calibrated.
 
     ``before`` (thin, dashed) and ``after`` (solid) the calibration, {object: {method: table}} of the same
-    objects; a method in one of them only has that line only. ValueError for other objects, or none.
+    objects; a method in one of them only has that line only.
     """
-    if list(before) != list(after):
-        raise ValueError(f"before and after must have the same objects, got {list(before)} and {list(after)}")
-    figure, axes = _make_panels("before", before)
+    figure, axes = _make_row(len(before))
     for axis, name in zip(axes, before, strict=True):
-        check_filled(f"after[{name!r}]", after[name])
         _draw_diagonal(axis, name, "Expected coverage (%)")
         for method in _sort_methods(after[name]):
             _draw_coverage(axis, after[name][method], get_line_style(method))
@@ -217,11 +208,8 @@ def plot_reliability(before: Mapping[str, pd.DataFrame], after: Mapping[str, pd.
     """Reliability diagram: how often a match is near a mode, against the confidence that it is; grey: calibrated.
 
     ``before`` (rings) and ``after`` (dots with 95 % intervals) the calibration, {object: rows} of the same objects by
-    `mmgsd.measure.uncertainty.compute_reliability`. ValueError for other objects, or none.
+    `mmgsd.measure.uncertainty.compute_reliability`.
     """
-    check_filled("before", before)
-    if list(before) != list(after):
-        raise ValueError(f"before and after must have the same objects, got {list(before)} and {list(after)}")
     figure, axes = _make_row(len(before))
     style = get_line_style("mmgsd")
     for axis, name in zip(axes, before, strict=True):
@@ -243,14 +231,6 @@ def _draw_diagonal(axis: Axes, name: str, promised: str) -> None:
              xticks=range(0, 101, 25), yticks=range(0, 101, 25))  # fmt: skip
 
 
-def _make_panels(name: str, tables: Tables) -> tuple[Figure, np.ndarray]:
-    """A row of axes, one an object; ValueError where there is no object, or one without methods."""
-    check_filled(name, tables)
-    for key, methods in tables.items():
-        check_filled(f"{name}[{key!r}]", methods)
-    return _make_row(len(tables))
-
-
 def _make_row(count: int) -> tuple[Figure, np.ndarray]:
     figure, axes = plt.subplots(1, count, figsize=(COLUMN_IN, 2.2), layout="constrained", squeeze=False)
     return figure, axes[0]
@@ -263,13 +243,14 @@ def _sort_methods(methods: Iterable[str]) -> list[str]:
 
 
 def _draw_risk(axis: Axes, error: pd.Series, score: pd.Series, style: dict) -> None:
-    coverage, risk = compute_risk_coverage(error, score)
+    coverage, risk = measured.compute_risk_coverage(error, score)
     chosen = np.unique((np.arange(1, CURVE_POINTS + 1) * len(risk) - 1) // CURVE_POINTS)  # the last always
     axis.plot(100 * coverage[chosen], risk[chosen], **style)
 
 
 def _draw_coverage(axis: Axes, queries: pd.DataFrame, style: dict) -> None:
-    axis.plot(100 * np.array(LEVELS), 100 * compute_coverage(get_distances(queries)), **style)
+    shares = measured.compute_coverage(measured.get_distances(queries))
+    axis.plot(100 * np.array(measured.LEVELS), 100 * shares, **style)
 
 
 STUDY = Study(

@@ -31,13 +31,6 @@ def test_a_row_a_task_and_a_column_a_picture() -> None:
     assert [axis.get_ylabel() for axis in figure.axes] == ["in half", "", "unfold", ""]
 
 
-def test_tasks_of_other_columns_and_none_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"the columns \['found'\] for each task, got \['MMGSD'\] of 'unfold'"):
-        plot_rollouts({"in half": {"found": PICTURE}, "unfold": {"MMGSD": PICTURE}})
-    with pytest.raises(ValueError, match="pictures"):
-        plot_rollouts({})
-
-
 def test_the_middle_square_is_shown() -> None:
     picture = PICTURE.copy()
     picture[:, 8:56] = 255
@@ -60,8 +53,6 @@ def test_moves_are_arrows_from_pick_to_place() -> None:
     ends = {(*text.xyann, *text.xy) for text in first.texts}
     assert ends == {(5, 6, 40, 30), (8, 9, -10, 50)} and len(second.texts) == 2  # a dark and a bright one each
     assert first.get_xlim() == (-0.5, 63.5)
-    with pytest.raises(ValueError, match="pictures must not be empty"):
-        plot_moves({})
 
 
 def test_slides_hold_pairs_with_their_moves(tmp_path: Path) -> None:
@@ -70,8 +61,6 @@ def test_slides_hold_pairs_with_their_moves(tmp_path: Path) -> None:
     path = save_slides([(PICTURE, moved), (moved, PICTURE)], tmp_path / "slides.webp")
     with Image.open(path) as slides:
         assert slides.n_frames == 2 and slides.width == 2 * slides.height
-    with pytest.raises(ValueError, match="slides must not be empty"):
-        save_slides([], path)
 
 
 def test_success_has_a_dot_with_its_interval_for_what_was_measured() -> None:
@@ -84,5 +73,3 @@ def test_success_has_a_dot_with_its_interval_for_what_was_measured() -> None:
     assert [tick.get_text() for tick in cloth.get_yticklabels()] == ["true matches", "MMGSD, modes that agree"]
     assert [len(axis.containers) for axis in (cloth, rope)] == [2, 1]
     assert cloth.get_title() == "Cloth, 7 rollouts" and cloth.containers[1].lines[0].get_xdata().tolist() == [75.0]
-    with pytest.raises(ValueError, match="results"):
-        plot_success({"policies": {"cloth": {}, "rope": {}}})

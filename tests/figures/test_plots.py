@@ -11,7 +11,7 @@ from heatmaps import make_match
 from matplotlib.figure import Figure
 from matplotlib.patches import ConnectionPatch
 
-from mmgsd.figures import answers, plots
+from mmgsd.figures import plots
 from mmgsd.figures import style as drawing
 
 
@@ -96,7 +96,7 @@ def test_a_page_holds_so_many_queries(queries):
 
 
 def test_plot_teaser_has_three_panels_a_match():
-    figure = answers.plot_teaser({"cloth": [make_match(height=60)], "rope": [make_match()]})
+    figure = plots.plot_teaser({"cloth": make_match(height=60), "rope": make_match()})
     assert len(figure.axes) == 6
     assert figure.get_figwidth() == pytest.approx(drawing.COLUMN_IN)
 
@@ -104,7 +104,7 @@ def test_plot_teaser_has_three_panels_a_match():
 def test_the_teaser_marks_every_match_and_leads_to_it_from_the_pixel():
     match = make_match(modes=4)
     match.modes[0, 3] = np.nan
-    figure = answers.plot_teaser({"cloth": [match]})
+    figure = plots.plot_teaser({"cloth": match})
     source, target, _ = figure.axes
     marks = [tuple(mark.get_offsets()[0]) for mark in target.collections]
     assert marks == [pytest.approx(tuple(mode)) for mode in match.modes[0, :3]]
@@ -115,10 +115,8 @@ def test_the_teaser_marks_every_match_and_leads_to_it_from_the_pixel():
 
 def test_plot_samples_fills_a_sheet(rng):
     images = list(rng.integers(0, 255, (5, 20, 30, 3), dtype=np.uint8))
-    figure = plots.plot_samples(images, [str(i) for i in range(5)], columns=3)
-    assert [axis.get_title() for axis in figure.axes] == list("01234")
-    with pytest.raises(ValueError, match="titles must be 5"):
-        plots.plot_samples(images, ["one"])
+    figure = plots.plot_samples(images, columns=3)
+    assert [axis.images[0].get_array().shape for axis in figure.axes] == [(20, 30, 3)] * 5
 
 
 @pytest.mark.parametrize("name", ["cloth", "rope"])
@@ -128,11 +126,6 @@ def test_plot_labels_tells_hidden_points_from_visible(rng, name):
     hidden, seen, *rings = figure.axes[1].collections
     assert len(hidden.get_offsets()) == (~visible).sum() and len(seen.get_offsets()) == visible.sum()
     assert np.asarray(rings[0].get_offsets()) == pytest.approx(xy[[0, 624]])
-
-
-def test_plot_labels_checks_shapes():
-    with pytest.raises(ValueError, match="visible"):
-        plots.plot_labels(np.zeros((4, 4, 3), np.uint8), np.zeros((3, 2)), np.ones(2, bool))
 
 
 def test_plot_orbits_draws_every_orbit_of_every_group(rng):
@@ -180,17 +173,6 @@ def test_save_figure_gives_the_same_bytes_twice(tmp_path):
     second = [path.read_bytes() for path in drawing.save_figure(figure, tmp_path / "match")]
     assert first == second
     assert sorted(path.name for path in tmp_path.iterdir()) == ["match.pdf", "match.png"]
-
-
-@pytest.mark.parametrize("call", [
-    lambda: answers.plot_teaser({}),
-    lambda: plots.plot_samples([]),
-    lambda: plots.plot_orbits(np.zeros((4, 4, 3), np.uint8), np.zeros((3, 2)), {}),
-    lambda: plots.plot_variety({}, {}),
-])  # fmt: skip
-def test_empty_input_is_an_error(call):
-    with pytest.raises(ValueError, match="must not be empty"):
-        call()
 
 
 def test_no_figure_stays_open():

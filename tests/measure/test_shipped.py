@@ -50,7 +50,7 @@ def test_weights_are_measured_on_both_sets(root: Path) -> None:
 
 
 def test_baselines_are_measured_on_both_sets(root: Path) -> None:
-    row = measure_baseline("daisy", "cloth", root, progress=False)
+    row = measure_baseline("orb", "cloth", root, progress=False)
     assert all(0 < row[preset]["rmse_mean"] < 700 for preset in shipped.SETS)
 
 
@@ -130,17 +130,17 @@ def test_photographs_alone_keep_what_renders_gave(root: Path, monkeypatch: pytes
 
 def test_photographs_alone_need_no_renders_of_anything(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     results = root / "data" / "results" / "shipped.json"
-    main("mine", "daisy")
+    main("mine", "orb")
     before = json.loads(results.read_text())
     for preset in shipped.SETS:
         shutil.rmtree(Paths(root, preset).dataset("cloth"))
     monkeypatch.setattr(shipped, "read_photographs", lambda *_: [])
     monkeypatch.setattr(shipped, "measure_answers", lambda *_, **__: {"best": 3.0})
     monkeypatch.setattr(shipped, "measure_photographs", lambda *_, **__: {"best": 4.0})
-    main("mine", "daisy", photographs=Path("somewhere"), photographs_alone=True)
+    main("mine", "orb", photographs=Path("somewhere"), photographs_alone=True)
     after = json.loads(results.read_text())
     assert after == {"mine": before["mine"] | {"photographs": {"best": 4.0}},
-                     "cloth-daisy": before["cloth-daisy"] | {"photographs": {"best": 3.0}}}  # fmt: skip
+                     "cloth-orb": before["cloth-orb"] | {"photographs": {"best": 3.0}}}  # fmt: skip
 
 
 def test_a_baseline_is_read_as_the_shipped_weights_are(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -151,11 +151,11 @@ def test_a_baseline_is_read_as_the_shipped_weights_are(root: Path, monkeypatch: 
             matcher.readout = dataclasses.replace(matcher.readout, mean_exponent=6.0)
             return matcher
 
-    rows = [measure_baseline("daisy", "cloth", root, progress=False)]
+    rows = [measure_baseline("orb", "cloth", root, progress=False)]
     monkeypatch.setattr(shipped, "Matcher", Sharp)
-    rows.append(measure_baseline("daisy", "cloth", root, progress=False))
+    rows.append(measure_baseline("orb", "cloth", root, progress=False))
     assert [row["sharpness"] for row in rows] == [1, 6]
-    assert [shipped.name_read("cloth-daisy", row) for row in rows] == ["cloth-daisy", "cloth-daisy@1,6"]
+    assert [shipped.name_read("cloth-orb", row) for row in rows] == ["cloth-orb", "cloth-orb@1,6"]
     assert rows[0]["paper"]["rmse_mean"] != rows[1]["paper"]["rmse_mean"]
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from mmgsd.report.claims import describe_claims, list_claims, make_findings, sum_minutes
+from mmgsd.report.tables import describe_claims, list_claims, make_findings, sum_minutes
 from mmgsd.studies.claims import Claim
 from mmgsd.studies.registry import list_studies, load_results
 from mmgsd.studies.table import to_markdown

@@ -13,7 +13,6 @@ from mmgsd.config import METHODS, OBJECTS, PRESETS
 from mmgsd.measure.metrics import PCK_PX, summarise_errors
 from mmgsd.measure.regions import find_regions
 from mmgsd.paths import find_root
-from mmgsd.report.claims import describe_claims, list_claims
 from mmgsd.report.latex import (
     CLAIMS,
     NOT_RUN,
@@ -25,6 +24,7 @@ from mmgsd.report.latex import (
     to_latex,
     write_report,
 )
+from mmgsd.report.tables import describe_claims, list_claims
 from mmgsd.studies.claims import HELD, IN_PART, NOT_HELD, NOT_MEASURED, get, is_better, judge
 from mmgsd.studies.figure_data import FigureData
 from mmgsd.studies.places import measure_places
@@ -270,13 +270,14 @@ def test_other_tables_have_their_numbers() -> None:
     assert rows["runs_table"]["SPCL"] == ["100", "1.5"] * 2
 
 
-def test_negative_numbers_have_a_minus() -> None:
-    assert set_text("-0.05 → -1") == r"$-$0.05\,$\to$\,$-$1" and set_text("8-15, a-b") == "8-15, a-b"
-
-
-def test_markup_and_units_are_set() -> None:
-    assert set_text("**ours**, *theirs*, `v_4`") == r"\textbf{ours}, \emph{theirs}, \texttt{v\_4}"
-    assert set_text("50 % within 20 px; σ px") == r"50\,\% within 20~px; $\sigma$ px"
+@pytest.mark.parametrize(("text", "latex"), [
+    ("-0.05 → -1", r"$-$0.05\,$\to$\,$-$1"),
+    ("8-15, a-b", "8-15, a-b"),
+    ("**ours**, *theirs*, `v_4`", r"\textbf{ours}, \emph{theirs}, \texttt{v\_4}"),
+    ("50 % within 20 px; σ px", r"50\,\% within 20~px; $\sigma$ px"),
+])  # fmt: skip
+def test_markup_units_and_signs_are_set(text: str, latex: str) -> None:
+    assert set_text(text) == latex
 
 
 def test_claims_table_prints_each_verdict() -> None:
@@ -309,14 +310,13 @@ def test_a_preset_that_does_not_exist_is_refused(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_places_are_means_over_visible_queries(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_places_are_means_over_visible_queries() -> None:
     points = np.arange(625)
     queries = pd.DataFrame({"point": points, "visible": points != 312, "rmse_px": np.abs(points - 312.0)})
     data = FigureData({"mmgsd": summarise_errors(queries)}, 1.0, {}, [np.zeros((4, 2))])
-    monkeypatch.setattr("mmgsd.studies.figure_data.load_figure_data", lambda path: data)
-    rope = measure_places(tmp_path / "figures_rope.safetensors", "rope")
+    rope = measure_places(data, "rope")
     assert rope["end"] > 250 and rope["middle"] == pytest.approx(31.5, abs=1)  # 1 to 62, without the hidden one
-    cloth = measure_places(tmp_path / "figures_cloth.safetensors", "cloth")
+    cloth = measure_places(data, "cloth")
     corner = find_regions()["corner"]
     assert cloth["corner"] == pytest.approx(queries.rmse_px[corner].mean()) and set(cloth) == set(REGIONS)
 

@@ -41,6 +41,12 @@ def write_results(paths: Paths, results: dict[str, Any]) -> None:
         (paths.results / f"{name}.json").write_text(json.dumps(content))
 
 
+def touch_answers(paths: Paths) -> None:
+    for name in ANSWERS:
+        paths.queries(name).parent.mkdir(parents=True, exist_ok=True)
+        paths.queries(name).touch()
+
+
 def change(error: float, **others: float) -> dict[str, Any]:
     """What is stored, with other errors of MMGSD, and others, on the cloth."""
     results = copy.deepcopy(STORED)
@@ -54,9 +60,7 @@ def paths(tmp_path: Path) -> Paths:
     """A preset with stored results and all answers there."""
     paths = Paths(tmp_path, "quick")
     write_results(paths, STORED)
-    for name in ANSWERS:
-        paths.queries(name).parent.mkdir(parents=True, exist_ok=True)
-        paths.queries(name).touch()
+    touch_answers(paths)
     return paths
 
 
@@ -103,18 +107,18 @@ def test_the_same_results_are_equal_and_no_file_is_new(paths: Paths) -> None:
 
 
 def test_numbers_that_agree_differ_are_missing_or_new_are_told_apart(paths: Paths) -> None:
-    found = change(55.0, sift=90.0, daisy=70.0)
+    found = change(55.0, sift=90.0, orb=70.0)
     del found["uncertainty"]
     table = compare_numbers(STORED, found, paths)["agrees"]
     assert table.to_dict() == {
         ("rmse", "cloth", "mmgsd", "rmse_mean"): "agrees",
         ("rmse", "cloth", "sift", "rmse_mean"): "differs",
-        ("rmse", "cloth", "daisy", "rmse_mean"): "not run here",
+        ("rmse", "cloth", "orb", "rmse_mean"): "not run here",
         ("sigma", "cloth", "4", "rmse_mean"): "equal",
         ("uncertainty, calibrated", "cloth", "mmgsd", "spearman"): "missing",
     }
-    paths.queries("cloth-daisy").touch()
-    assert compare_numbers(STORED, found, paths)["agrees"]["rmse", "cloth", "daisy", "rmse_mean"] == "new"
+    paths.queries("cloth-orb").touch()
+    assert compare_numbers(STORED, found, paths)["agrees"]["rmse", "cloth", "orb", "rmse_mean"] == "new"
 
 
 @pytest.mark.parametrize("answers", ANSWERS)
@@ -172,9 +176,7 @@ def test_without_stored_results_all_is_new(tmp_path: Path) -> None:
     paths = Paths(tmp_path, "quick")
     keep_stored(paths)
     write_results(paths, STORED)
-    for name in ANSWERS:
-        paths.queries(name).parent.mkdir(parents=True, exist_ok=True)
-        paths.queries(name).touch()
+    touch_answers(paths)
     summary = judge_run(paths).summary
     assert "0 of 0 numbers" in summary and "4 new" in summary and "mean nothing" not in summary
 

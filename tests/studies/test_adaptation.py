@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 from mmgsd.measure.photographs import Photograph
+from mmgsd.paths import Paths
 from mmgsd.studies import adaptation
-from mmgsd.studies.adaptation import figure, find_most, list_cells, measure_cell, run, table, tabulate
+from mmgsd.studies.adaptation import describe_adaptation, find_most, list_cells, measure_cell, run, tabulate
+from mmgsd.studies.table import to_markdown
 
 
 def make_photographs(**counts: int) -> list[Photograph]:
@@ -51,7 +53,7 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Any]:
 
 def test_no_photograph_is_learnt_from_and_asked_about(asked: list[Any]) -> None:
     photographs = make_photographs(some=5, other=1)
-    measure_cell(("cloth", "some", "marked", 2, 3), photographs, "cloth", steps=4)
+    measure_cell(("cloth", "some", "marked", 2, 3), photographs, steps=4)
     learnt, (*sources, first, second, third) = asked
     assert len(sources) == 2 and all(name in learnt for name in sources)
     assert not any(name in learnt for name in (first, second, third, "other0.png"))
@@ -61,16 +63,14 @@ def test_what_is_measured_is_kept_and_told(
     asked: list[Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(adaptation, "read_photographs", lambda *_: make_photographs(some=5, other=1))
-    how = {"objects": ["cloth"], "splits": 2, "out": tmp_path / "adaptation.json", "progress": False}
-    results = adaptation.read_results(run("folder", **how))
+    paths, how = Paths(tmp_path, "paper"), {"folder": "folder", "objects": ["cloth"], "splits": 2, "progress": False}
+    results = adaptation.read_results(run(paths, **how))
     assert len(results) == 2 * 3 and results["cloth/some/unmarked/2/0"] == {"refused": "mark some"}
     before = len(asked)
-    run("folder", **how)
+    run(paths, **how)
     assert len(asked) == before
-    assert table(results).splitlines()[2:] == [
+    assert to_markdown(describe_adaptation(results)).splitlines()[2:] == [
         "| cloth, as shipped | 60 % / 10 % | – | 60 % / 10 % | – | +0% |",
         "| cloth, 2 with marks | 80 % / 10 % | – | 80 % / 10 % | – | +5% |",
     ]
     assert set(tabulate(results)["kind"]) == {"marked"}
-    drawn = figure(results).axes[0].lines
-    assert [line.get_ydata().tolist() for line in drawn[:2]] == [[60, 80], [60, 80]]

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import pytest
-
 from mmgsd.studies.robustness import plot_robustness
 
 ROWS = {
     "cloth": {"paper": {"rmse_mean": 20.0}, "workspace": {"rmse_mean": 30.0}, "photographs": {"found@5%": 0.6}},
     "cloth-paper": {"paper": {"rmse_mean": 26.0}, "workspace": {"rmse_mean": 90.0}},
-    "rope-daisy": {"paper": {"rmse_mean": 70.0}},
+    "rope-orb": {"paper": {"rmse_mean": 70.0}},
 }
 
 
@@ -18,7 +16,7 @@ def test_bars_are_what_was_measured() -> None:
     widths = [[round(bar.get_width(), 6) for bar in axis.patches] for axis in figure.axes]
     assert widths == [[20, 26, 70], [30, 90], [60]]
     assert [label.get_text() for label in figure.axes[0].get_yticklabels()] == [
-        "Cloth: MMGSD, shipped", "Cloth: MMGSD, clean images only", "Rope: DAISY",
+        "Cloth: MMGSD, shipped", "Cloth: MMGSD, clean images only", "Rope: ORB",
     ]  # fmt: skip
 
 
@@ -33,8 +31,3 @@ def test_bars_are_of_one_reading() -> None:
 def test_errors_share_an_axis_from_zero() -> None:
     limits = [axis.get_xlim() for axis in plot_robustness(ROWS).axes]
     assert limits[0] == limits[1] and limits[0][0] == 0 and limits[0][1] > 90 and limits[2] == (0, 100)
-
-
-def test_no_row_is_refused() -> None:
-    with pytest.raises(ValueError, match="rows"):
-        plot_robustness({})

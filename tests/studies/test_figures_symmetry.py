@@ -27,8 +27,3 @@ def test_the_study_has_a_map_a_group_rings_and_bars(points):
     assert [line.get_color() for line in rings.lines] == [get_colour(group) for group in ("v4", "c4")]
     assert errors.get_ylim()[0] == rings.get_ylim()[0] == 0  # no bar is cut off
     assert [bar.get_facecolor() for bar in errors.patches[::3]] == [to_rgba(get_colour(g)) for g in ("v4", "c4")]
-
-
-def test_nothing_to_study_is_refused():
-    with pytest.raises(ValueError, match="places must not be empty"):
-        plot_symmetry_study({})

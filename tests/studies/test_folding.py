@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -13,9 +14,10 @@ from mmgsd.fold.demonstration import Look, read_demonstration
 from mmgsd.fold.moves import PolicyAnswer
 from mmgsd.fold.state import State, read_state, write_state
 from mmgsd.fold.tasks import GROUNDS, TASKS
+from mmgsd.paths import Paths
 from mmgsd.studies import folding as rollouts
 from mmgsd.studies import policies
-from mmgsd.studies.folding import choose_shown, find_on_table, list_rollouts, run_folding, summarise_rollouts
+from mmgsd.studies.folding import choose_shown, find_on_table, list_rollouts, run, summarise_rollouts
 from mmgsd.studies.policies import POLICIES, SHIPPED, digest_policy, find_answering
 from mmgsd.studies.registry import load_results
 
@@ -27,14 +29,14 @@ POSE = np.array([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 2.5], [0, 0, 0, 1]]) 
 MATRIX = np.array([[60.0, 0, 49.5], [0, 60, 49.5], [0, 0, 1]])
 
 
-def lay(object: str, about: dict, *, moved: float = 0.0) -> State:
-    points = FLAT[object] + (moved, 0, 0)
+def lay(object: str, about: dict, *, points: np.ndarray | None = None) -> State:
+    """A state on the table, of which the middle is seen; the object lies flat unless ``points`` say otherwise."""
+    points = (FLAT[object] if points is None else points).astype(np.float32)
     mask = np.zeros((100, 100), bool)
-    mask[35:65, 35:65] = True
-    state = State(points.astype(np.float32), points.astype(np.float32), np.zeros((100, 100, 3), np.uint8), mask,
-                  np.zeros((625, 2), np.float32), np.ones(625, bool), MATRIX, POSE, FLAT[object].astype(np.float32),
-                  about)  # fmt: skip
-    return State(**{**state.__dict__, "xy": state.project(points).astype(np.float32)})
+    mask[38:62, 38:62] = True
+    state = State(points, points, np.zeros((100, 100, 3), np.uint8), mask, np.zeros((625, 2), np.float32),
+                  np.ones(625, bool), MATRIX, POSE, points, about)  # fmt: skip
+    return dataclasses.replace(state, xy=state.project(points).astype(np.float32))
 
 
 @pytest.fixture
@@ -74,30 +76,30 @@ def test_rollouts_go_through_tasks_starts_and_grounds_in_turn() -> None:
 
 
 def test_a_run_makes_every_state_once_and_a_second_none(tmp_path: Path, physics: list[str]) -> None:
-    out = run_folding("smoke", tmp_path, policies=ASKED, progress=False)
+    out = run(Paths(tmp_path, "smoke"), policies=ASKED, progress=False)
     results = json.loads(out.read_text())
     assert results["run"]["rollouts"] == 2
     assert list(results["policies"]["cloth"]) == ["truth", "random", "nothing"]
     assert results["policies"]["cloth"]["truth"]["all"]["error"]["count"] == 2
     assert len(physics) == len(set(physics)) and any(name.startswith("random-edge") for name in physics)
     count = len(physics)
-    again = json.loads(run_folding("smoke", tmp_path, policies=ASKED, progress=False).read_text())
+    again = json.loads(run(Paths(tmp_path, "smoke"), policies=ASKED, progress=False).read_text())
     assert len(physics) == count and again["policies"] == results["policies"]
 
 
 def test_an_interrupted_run_goes_on_from_its_files(tmp_path: Path, physics: list[str]) -> None:
-    run_folding("smoke", tmp_path, policies=ASKED, progress=False)
+    run(Paths(tmp_path, "smoke"), policies=ASKED, progress=False)
     answers = sorted((tmp_path / "data/generated/smoke/folding/answers").iterdir())
     kept = {path: path.read_bytes() for path in answers}
     answers[0].unlink()
     answers[1].write_text("{")
     with pytest.warns(UserWarning, match="damaged"):
-        run_folding("smoke", tmp_path, policies=ASKED, progress=False)
+        run(Paths(tmp_path, "smoke"), policies=ASKED, progress=False)
     assert all(path.read_bytes() == content for path, content in kept.items())
 
 
 def test_a_rollout_that_is_a_success_untouched_does_not_count(tmp_path: Path, physics: list[str]) -> None:
-    results = json.loads(run_folding("smoke", tmp_path, policies=ASKED, progress=False).read_text())
+    results = json.loads(run(Paths(tmp_path, "smoke"), policies=ASKED, progress=False).read_text())
     rows = results["policies"]["cloth"]  # nothing moves, and the demonstration's end is its start
     assert rows["nothing"]["all"]["success"]["mean"] == 1
     assert rows["truth"]["all"]["success"]["mean"] == 1 and "reachable" not in rows["truth"]
@@ -139,8 +141,8 @@ def test_demonstrations_are_written_as_a_users_are_read(tmp_path: Path, physics:
 
 
 def test_rows_of_other_policies_stay(tmp_path: Path, physics: list[str]) -> None:
-    run_folding("smoke", tmp_path, policies=ASKED, progress=False)
-    results = json.loads(run_folding("smoke", tmp_path, policies=ASKED[:1], progress=False).read_text())
+    run(Paths(tmp_path, "smoke"), policies=ASKED, progress=False)
+    results = json.loads(run(Paths(tmp_path, "smoke"), policies=ASKED[:1], progress=False).read_text())
     assert list(results["policies"]["rope"]) == ["truth", "random", "nothing"]
 
 
@@ -187,7 +189,7 @@ def test_the_command_runs_shipped_weights_or_trained_models(
     told: dict, names: set[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[set[str]] = []
-    monkeypatch.setattr(rollouts, "run_folding", lambda *_, policies, **__: asked.append({p.name for p in policies}))
+    monkeypatch.setattr(rollouts, "run", lambda *_, policies, **__: asked.append({p.name for p in policies}))
     rollouts.main("smoke", **told)
     assert names <= asked[0] and "nothing" not in asked[0]
     assert any("quick" in name for name in asked[0]) == ("trained" in told)
@@ -195,7 +197,7 @@ def test_the_command_runs_shipped_weights_or_trained_models(
 
 def test_another_preset_has_no_rollouts(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="preset must be one of 'smoke', 'quick', 'paper'"):
-        run_folding("workspace", tmp_path)
+        run(Paths(tmp_path, "workspace"))
 
 
 def test_pixels_and_places_on_the_table_belong_together() -> None:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-from test_folding import FLAT, MATRIX, POSE
+from test_folding import FLAT, lay
 
-from mmgsd.fold.state import State, read_state, write_state
+from mmgsd.fold.state import read_state, write_state
 from mmgsd.fold.tasks import GROUNDS, STARTS
 from mmgsd.match.match import Match
 from mmgsd.paths import Paths
@@ -22,15 +21,6 @@ ABOUT = {"object": "cloth", "task": "grasp", "start": "flat", "ground": "plain",
          "mark": "", "thickness": 0.0}  # fmt: skip
 
 
-def lay(points: np.ndarray, about: dict) -> State:
-    mask = np.zeros((100, 100), bool)
-    mask[38:62, 38:62] = True
-    state = State(points.astype(np.float32), points.astype(np.float32), np.zeros((100, 100, 3), np.uint8), mask,
-                  np.zeros((625, 2), np.float32), np.ones(625, bool), MATRIX, POSE, points.astype(np.float32),
-                  about)  # fmt: skip
-    return dataclasses.replace(state, xy=state.project(points).astype(np.float32))
-
-
 def answer(modes: list[list[float]], spreads: list[float]) -> Match:
     image, n = np.zeros((100, 100, 3), np.uint8), len(modes)
     covariances = np.eye(2) * np.array(spreads)[:, None, None] ** 2
@@ -39,7 +29,7 @@ def answer(modes: list[list[float]], spreads: list[float]) -> Match:
 
 
 CORNER = int(grasp.CORNERS[1])  # one point inside the rim
-FLAT_CLOTH = lay(FLAT["cloth"], ABOUT)
+FLAT_CLOTH = lay("cloth", ABOUT)
 FOLDED = FLAT["cloth"].copy()
 FOLDED[CORNER, :2] = (0.02, -0.01)  # the second corner, laid beside the middle
 
@@ -65,13 +55,13 @@ def test_the_surest_is_the_narrowest_and_the_first_the_most_probable() -> None:
 def test_a_corner_is_lifted_that_lies_in_the_middle(
     pick: np.ndarray | None, after: np.ndarray, fault: str, distance: float, lifted: bool
 ) -> None:
-    state = lay(after, ABOUT | {"fault": fault})
+    state = lay("cloth", ABOUT | {"fault": fault}, points=after)
     found = judge_grasp(FLAT_CLOTH, None if pick is None else pick.tolist(), state)
     assert found == {"distance": pytest.approx(distance, abs=1e-4), "lifted": lifted}
 
 
 def test_a_corner_that_lay_there_before_was_not_lifted() -> None:
-    folded = lay(FOLDED, ABOUT)
+    folded = lay("cloth", ABOUT, points=FOLDED)
     assert not judge_grasp(folded, folded.xy[CORNER].tolist(), folded)["lifted"]
 
 
@@ -97,7 +87,7 @@ def test_a_run_lifts_what_is_grasped_at_a_corner(tmp_path: Path, monkeypatch: py
                 points = FOLDED
             about = ABOUT | {key: job[key] for key in ("start", "ground", "seed", "mark") if key in job}
             folder.mkdir(parents=True, exist_ok=True)
-            write_state(folder / f"{name}.npz", lay(points, about))
+            write_state(folder / f"{name}.npz", lay("cloth", about, points=points))
         return {name: folder / f"{name}.npz" for name in jobs}
 
     class Sure:

@@ -6,10 +6,14 @@ import numpy as np
 import pandas as pd
 import pytest
 from heatmaps import make_match
+from matplotlib.figure import Figure
 
-from mmgsd.measure.metrics import BIN_PX, ErrorSummary, summarise_errors
+from mmgsd.measure.metrics import BIN_PX, summarise_errors
 from mmgsd.studies import figure_data, main, sigma, training
+from mmgsd.studies.figure_data import FigureData
 from mmgsd.studies.models import get_colour, get_line_style
+
+TRUE = np.array([[10.0, 10.0], [30.0, 20.0]])
 
 
 def make_queries(error: float = 20.0, points: int = 625) -> pd.DataFrame:
@@ -19,15 +23,19 @@ def make_queries(error: float = 20.0, points: int = 625) -> pd.DataFrame:
     return pd.DataFrame({"point": point, "visible": visible, "rmse_px": rmse})
 
 
-def make_errors(points: int = 625) -> dict[str, dict[str, ErrorSummary]]:
+def make_drawn(points: int = 625) -> dict[str, FigureData]:
     errors = {"mmgsd": 20.0, "spcl": 40.0, "centre": 80.0}
-    return {o: {m: summarise_errors(make_queries(e, points)) for m, e in errors.items()} for o in ("cloth", "rope")}
+    summaries = {method: summarise_errors(make_queries(error, points)) for method, error in errors.items()}
+    return {name: FigureData(dict(summaries), size, {}, []) for name, size in (("cloth", 200.0), ("rope", 100.0))}
+
+
+def combine(*methods: str) -> Figure:
+    answers = {method: make_match(4) for method in (*methods, "mmgsd")}
+    return main.plot_combined({"rope": FigureData({}, 1.0, answers, [TRUE] * 4)})
 
 
 def test_plot_combined_has_five_columns():
-    methods = {method: make_match() for method in ("pcl", "spcl", "mmgsd")}
-    true = np.array([[10.0, 10.0], [30.0, 20.0]])
-    figure = main.plot_combined({"rope": methods}, {"rope": true}, {"rope": make_match(4)})
+    figure = combine("pcl", "spcl")
     assert len(figure.axes) == 10
     shown = figure.axes[3].images[0].get_array()
     assert shown.shape == (40, 60, 3)
@@ -35,25 +43,17 @@ def test_plot_combined_has_five_columns():
 
 
 def test_plot_combined_marks_modes_and_true_matches():
-    methods = {method: make_match() for method in ("pcl", "spcl", "mmgsd")}
-    true = np.array([[10.0, 10.0], [30.0, 20.0]])
-    source, *compared, first = main.plot_combined({"rope": methods}, {"rope": true}, {"rope": make_match(4)}).axes[:6]
+    source, *compared, first = combine("pcl", "spcl").axes[:6]
     assert [len(axis.patches) for axis in compared] == [2, 2, 0, 2]  # an ellipse a mode
     for axis in compared:
-        np.testing.assert_array_equal(axis.collections[-1].get_offsets(), true)
+        np.testing.assert_array_equal(axis.collections[-1].get_offsets(), TRUE)
     assert [text.get_text() for text in first.texts] == ["1", "2", "3", "4"]
 
 
 def test_plot_combined_says_what_is_not_trained():
-    methods = {method: make_match() for method in ("spcl", "mmgsd")}
-    figure = main.plot_combined({"rope": methods}, {"rope": np.array([[10.0, 10.0]])}, {})
-    assert [len(axis.images) for axis in figure.axes] == [1, 0, 1, 1, 1]
+    figure = combine("spcl")
+    assert [len(axis.images) for axis in figure.axes[:5]] == [1, 0, 1, 1, 1]
     assert [text.get_text() for text in figure.axes[1].texts] == ["not trained"]
-
-
-def test_plot_combined_wants_four_queries_inwards():
-    with pytest.raises(ValueError, match="must hold 4 queries, got 3"):
-        main.plot_combined({"rope": {"mmgsd": make_match()}}, {}, {"rope": make_match(3)})
 
 
 def test_compute_density_is_one_in_all_and_highest_at_the_data():
@@ -69,7 +69,7 @@ def test_compute_density_loses_nothing_at_zero():
 
 
 def test_plot_rmse_pdf_draws_visible_queries_in_percent():
-    figure = main.plot_rmse_pdf(make_errors(), {"cloth": 200.0, "rope": 100.0})
+    figure = main.plot_rmse_pdf(make_drawn())
     assert len(figure.axes) == 2
     for axis, peaks in zip(figure.axes, ((10, 20, 40), (20, 40, 80)), strict=True):
         found = [line.get_xdata()[line.get_ydata().argmax()] for line in axis.lines]
@@ -81,15 +81,15 @@ def test_plot_rmse_pdf_draws_visible_queries_in_percent():
 
 @pytest.mark.parametrize("points", [625, 25])
 def test_plot_spatial_rmse_draws_lines_and_maps(points):
-    figure = main.plot_spatial_rmse(make_errors(points))
+    drawn = make_drawn(points)
+    figure = main.plot_spatial_rmse(drawn)
     assert len(figure.axes) == 5  # the last two are the colour bars
     assert figure.axes[0].lines[1].get_ydata() == pytest.approx(40)
     values = [axis.images[0].get_array() for axis in figure.axes[1:3]]
     assert [float(v.mean()) for v in values] == pytest.approx([20, 40])
     assert [axis.images[0].get_clim()[1] for axis in figure.axes[1:3]] == pytest.approx([22, 44])  # each by its own
-    errors = make_errors(points)
-    del errors["cloth"]["spcl"]  # not trained
-    assert len(main.plot_spatial_rmse(errors).axes) == 3
+    del drawn["cloth"].errors["spcl"]  # not trained
+    assert len(main.plot_spatial_rmse(drawn).axes) == 3
 
 
 def test_plot_sigma_ablation_sorts_by_sigma():
@@ -116,7 +116,7 @@ def test_lines_that_lie_on_others_are_seen():
 
 def test_plot_training_has_a_panel_a_model():
     log = pd.DataFrame({"step": range(1, 6), "loss": [5.0, 4, 3, 2, 1], "seconds": range(60, 310, 60)})
-    figure = training.plot_training({"cloth mmgsd": log, "rope pcl": log, "rope mmgsd": log}, columns=2)
+    figure = training.plot_training({"cloth mmgsd": log, "rope pcl": log, "rope mmgsd": log})
     assert len(figure.axes) == 3
     assert figure.axes[0].lines[0].get_ydata().tolist() == [5, 4, 3, 2, 1]
     assert figure.axes[0].get_title() == "Cloth MMGSD · 5.0 min"
@@ -126,18 +126,3 @@ def test_compute_object_size_is_the_mean_diagonal():
     mask = np.zeros((20, 20), bool)
     mask[2:5, 3:7] = True  # 3 x 4 px
     assert figure_data.compute_object_size([mask, mask]) == pytest.approx(5)
-
-
-@pytest.mark.parametrize("call", [
-    lambda: main.plot_combined({}, {}, {}),
-    lambda: main.plot_rmse_pdf({}, {}),
-    lambda: main.plot_rmse_pdf({"cloth": {}}, {"cloth": 1.0}),
-    lambda: main.compute_density(np.zeros(3, int), 0.25),
-    lambda: main.plot_spatial_rmse({}),
-    lambda: sigma.plot_sigma_ablation({}),
-    lambda: training.plot_training({}),
-    lambda: figure_data.compute_object_size([]),
-])  # fmt: skip
-def test_empty_input_is_an_error(call):
-    with pytest.raises(ValueError, match="must not be empty"):
-        call()

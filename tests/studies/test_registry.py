@@ -12,7 +12,7 @@ import pytest
 import mmgsd.studies as studies
 from mmgsd.__main__ import main
 from mmgsd.paths import Paths
-from mmgsd.report import claims, latex, tables, verdict
+from mmgsd.report import latex, tables, verdict
 from mmgsd.studies.registry import load_results
 
 TOY = '''
@@ -83,8 +83,8 @@ def test_pages_report_claims_findings_and_verdict_have_a_new_study(root: Path) -
     assert "| who | speed m/s |" in page.read_text() and "| toy | 4.0 |" in page.read_text()
     texts = {path.stem: path.read_text() for path in latex.write_report("quick", root)}
     assert "toy & 4.0" in texts["toy_table"] and r"\defresult{verdict/toy}{held}" in texts["results"]
-    assert claims.list_claims(results)[-1].verdict == "held"
-    assert "| **held** | 4.0 m/s | `13_toy` |" in tables.to_markdown(claims.describe_claims(results))
+    assert tables.list_claims(results)[-1].verdict == "held"
+    assert "| **held** | 4.0 m/s | `13_toy` |" in tables.to_markdown(tables.describe_claims(results))
     found = [finding for study in studies.list_studies() for finding in study.findings]
     assert max(found, key=lambda finding: finding.place).name == "Toys"
     numbers = verdict.compare_numbers(results, {"toy": {"cloth": {"toy": {"speed": 4.6}}}}, Paths(root, "quick"))

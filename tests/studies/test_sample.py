@@ -24,7 +24,7 @@ def test_the_shipped_mmgsd_answers_the_sample_better_than_spcl(monkeypatch: pyte
 
 def test_another_groups_matches_can_be_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sample, "QUESTIONS", EvaluateConfig(pairs=1, points=9))
-    table = sample.ask_sample(sample.load_shipped("rope"), sample.load_sample(ROOT, "rope"), group="identity", modes=2)
+    table = sample.ask_sample(sample.load_shipped("rope"), sample.load_sample(ROOT, "rope"), group="identity")
     assert set(table.n) == {1}
 
 

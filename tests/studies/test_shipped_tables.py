@@ -25,7 +25,7 @@ SET = {
     "within_radius": 0.91,
 }  # fmt: skip
 ROWS = {
-    "cloth-daisy": {"paper": {"rmse_mean": 71.25}},
+    "cloth-orb": {"paper": {"rmse_mean": 71.25}},
     "cloth-paper": {"calibrated": False, "paper": {"rmse_mean": 26.1}, "workspace": {"rmse_mean": 88.0}},
     "cloth": {"calibrated": True, "paper": SET, "workspace": SET, "photographs": FOUND, "milliseconds": 120.4,
               "hardware": "CPU, 2 cores", "object": "cloth", "side_px": 300.0},
@@ -35,14 +35,14 @@ ROWS = {
 
 
 def test_rows_are_in_the_order_of_interest() -> None:
-    assert list_names(ROWS, "cloth") == ["cloth", "cloth-paper", "cloth-daisy"]
+    assert list_names(ROWS, "cloth") == ["cloth", "cloth-paper", "cloth-orb"]
 
 
 def test_what_was_not_measured_is_a_dash() -> None:
     lines = to_markdown(describe_pictures(ROWS)).splitlines()
     assert lines[2] == "| cloth, `cloth` | 21.0 | 21.0 | 51 % (40 to 62) | 25 % | 31 % | 8.0 % |"
     assert lines[3] == "| cloth, `cloth-paper` | 26.1 | 88.0 | – | – | – | – |"
-    assert lines[4] == "| cloth, DAISY | 71.2 | – | – | – | – | – |"
+    assert lines[4] == "| cloth, ORB | 71.2 | – | – | – | – | – |"
     assert len({line.count("|") for line in lines}) == 1
 
 
@@ -51,7 +51,7 @@ def test_one_table_has_one_reading_and_one_set_of_marks() -> None:
     rows = {
         "cloth": ROWS["cloth"] | own, "cloth-paper": ROWS["cloth-paper"] | means | {"photographs": FOUND},
         "cloth-paper@1,6": own | {"photographs": FOUND | {"found@5%": 0.64, "intervals": {}}},
-        "cloth-daisy": {"photographs": FOUND}, "cloth-imagenet@1,6": own | {"photographs": FOUND | {"marks": "old"}},
+        "cloth-orb": {"photographs": FOUND}, "cloth-imagenet@1,6": own | {"photographs": FOUND | {"marks": "old"}},
         "rope": ROWS["rope"] | own,
     }  # fmt: skip
     assert list_names(rows, "cloth") == ["cloth", "cloth-paper@1,6", "cloth-imagenet@1,6"]
@@ -100,7 +100,7 @@ def test_the_parts_budget_is_said() -> None:
 def test_knowledge_is_of_weights_alone() -> None:
     lines = to_markdown(describe_knowledge(ROWS)).splitlines()
     assert lines[2] == "| `cloth`, clean | 0.95 | 0.90 | 0.98 | – | 0.026 | 0.010 | 0.91 |"
-    assert not any("daisy" in line.lower() for line in lines)
+    assert not any("orb" in line.lower() for line in lines)
 
 
 def test_sentences_name_the_sources_and_count_the_photographs() -> None:

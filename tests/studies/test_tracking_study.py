@@ -12,8 +12,10 @@ from mmgsd.files import read_json
 from mmgsd.fold.state import read_state
 from mmgsd.fold.tasks import MOTIONS
 from mmgsd.measure.tracking import Truth, measure_track
+from mmgsd.paths import Paths
 from mmgsd.studies import tracking
-from mmgsd.studies.tracking import METHODS, POINTS, list_films, summarise
+from mmgsd.studies.table import to_markdown
+from mmgsd.studies.tracking import METHODS, POINTS, describe_tracking, list_films, summarise
 from mmgsd.symmetry import load_group
 
 
@@ -49,10 +51,13 @@ def test_a_film_goes_all_the_way_and_what_is_finished_is_kept(
     monkeypatch.setattr(tracking, "MOTIONS", ("gripper",))
     monkeypatch.setattr(tracking, "METHODS", {name: METHODS[name] for name in ("lucas_kanade", "dis")})
     how = {"count": 1, "frames": 3, "scale": 0.25, "workers": 1, "progress": False}
-    out = tracking.run("smoke", tmp_path, **how)
+    paths = Paths(tmp_path, "smoke")
+    out = tracking.run(paths, **how)
     results = read_json(out)
     assert set(results["methods"]["cloth"]) == {"lucas_kanade", "dis"}
     assert results["methods"]["cloth"]["dis"]["gripper"]["films"] == 1
+    row = to_markdown(describe_tracking(results)).splitlines()[3]
+    assert row.startswith("| DIS flow, chained | ") and row.count(" % |") == 4
     (file,) = tmp_path.glob("data/generated/smoke/folding/films/*.npz")
     film = read_state(file)
     assert film.image.shape == (3, 121, 121, 3) and film.xy.shape == (3, 625, 2)
@@ -63,5 +68,5 @@ def test_a_film_goes_all_the_way_and_what_is_finished_is_kept(
     assert np.isfinite(corners).all()
     before = file.stat().st_mtime_ns
     monkeypatch.setattr(tracking, "measure_track", lambda *_: pytest.fail("asked again"))
-    tracking.run("smoke", tmp_path, **how)
+    tracking.run(paths, **how)
     assert file.stat().st_mtime_ns == before
