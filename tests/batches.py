@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from mmgsd.scene.__main__ import write_view
+from mmgsd.scene.batch import write_view
 
 WIDTH, HEIGHT = 640, 480
 

@@ -28,15 +28,6 @@ class Motion:
         return to_points(self.factor * to_complex(points) + self.shift)
 
 
-@dataclass(frozen=True, eq=False)
-class Consensus:
-    """The motion that most answers agree with, how many of the questions do, and each one's mode."""
-
-    motion: Motion
-    share: float  # of the questions whose mode is near
-    chosen: np.ndarray  # (S,) index of the mode nearest to where the motion takes a question; -1 where none is near
-
-
 def to_complex(points: np.ndarray) -> np.ndarray:
     """Points (…, 2) as numbers (…)."""
     points = np.asarray(points, float)
@@ -50,9 +41,10 @@ def to_points(numbers: np.ndarray) -> np.ndarray:
 
 def find_consensus(
     asked: np.ndarray, modes: np.ndarray, weights: np.ndarray, *, free_scale: bool = False
-) -> Consensus | None:
-    """The agreement of modes (S, n, 2) with weights (S, n) about ``asked`` (S, 2), one unit for all; None of none.
+) -> tuple[Motion, float] | None:
+    """The motion that most modes (S, n, 2) with weights (S, n) agree with, and the share of the questions that do.
 
+    Questions ``asked`` (S, 2) and modes are in one unit; None where no two are at a possible distance.
     Every two questions and their modes propose a motion, with their distance's scale where ``free_scale``; the one
     whose modes near by weigh most is fitted again to these. NaN modes do not count. ValueError for fewer than two
     questions, or all at one place.
@@ -71,8 +63,7 @@ def find_consensus(
         near = _weigh(motion, source, target, weights, 2 * RADIUS * extent)
         motion = _fit(source, target, near, motion, free_scale)
     near = _weigh(motion, source, target, weights, 2 * RADIUS * extent)
-    chosen = np.where(near.max(1) > 0, near.argmax(1), -1)
-    return Consensus(Motion(*map(complex, motion)), float(np.mean(chosen >= 0)), chosen)
+    return Motion(*map(complex, motion)), float(np.mean(near.max(1) > 0))
 
 
 def _propose(source: np.ndarray, target: np.ndarray, free_scale: bool) -> np.ndarray:
@@ -136,7 +127,7 @@ def refine_motion(asked: np.ndarray, modes: np.ndarray, motion: Motion, *, free_
     method for registration of 3-D shapes" (1992). Questions without a mode do not count; of fewer than two, the same.
     """
     for _ in range(ROUNDS):
-        nearest = _take_nearest(motion.apply(asked), modes)
+        nearest = modes[np.arange(len(modes)), _find_gaps(motion.apply(asked), modes).argmin(1)]
         known = np.isfinite(nearest).all(1)
         if known.sum() < 2:
             return motion
@@ -144,10 +135,9 @@ def refine_motion(asked: np.ndarray, modes: np.ndarray, motion: Motion, *, free_
     return motion
 
 
-def _take_nearest(wanted: np.ndarray, modes: np.ndarray) -> np.ndarray:
-    """(S, 2): of each question's modes (S, n, 2) the one nearest to a place (S, 2); NaN of none."""
-    distance = np.nan_to_num(np.linalg.norm(modes - wanted[:, None], axis=-1), nan=np.inf)
-    return modes[np.arange(len(modes)), distance.argmin(1)]
+def _find_gaps(wanted: np.ndarray, modes: np.ndarray) -> np.ndarray:
+    """Distances (S, n) of each place of (S, 2) to its modes (S, n, 2), infinite to none."""
+    return np.nan_to_num(np.linalg.norm(modes - wanted[:, None], axis=-1), nan=np.inf)
 
 
 def assign_grasps(asked: np.ndarray, modes: np.ndarray, motion: Motion, *, min_distance: float) -> np.ndarray:
@@ -157,7 +147,7 @@ def assign_grasps(asked: np.ndarray, modes: np.ndarray, motion: Motion, *, min_d
     choice is worst chooses first, and what is taken is no choice of the others; none (NaN) where nothing is left.
     """
     wanted, taken = motion.apply(asked), np.full((len(asked), 2), np.nan)
-    distance = np.nan_to_num(np.linalg.norm(modes - wanted[:, None], axis=-1), nan=np.inf)  # (S, n)
+    distance = _find_gaps(wanted, modes)
     allowed = np.minimum(min_distance, np.linalg.norm(wanted[:, None] - wanted, axis=-1) / 2)  # (S, S)
     left = set(range(len(asked)))
     while left := {k for k in left if np.isfinite(distance[k]).any()}:

@@ -24,16 +24,10 @@ from mmgsd.fold.tasks import GROUNDS, MOTIONS, STARTS, Move, Task, find_task, pl
 from mmgsd.progress import ProgressBar
 from mmgsd.scene.stage import connect, run_job
 
-__all__ = ["State", "act_job", "demonstration_job", "film_job", "look_job", "read_state", "run_jobs", "start_job",
-           "true_moves"]  # fmt: skip
-
 VERSION = 1  # to be raised where the same job gives another state than before
 JOBS_A_BATCH = 12  # a child process ends after so many at most: it takes seconds to start
 
 PixelMove = tuple[tuple[float, float], tuple[float, float]]  # pick and place, (x, y) px each
-
-
-# Jobs. --------------------------------------------------------------------------------------------------------------
 
 
 def start_job(task: Task, start: str, ground: str, seed: int) -> dict:
@@ -44,34 +38,22 @@ def start_job(task: Task, start: str, ground: str, seed: int) -> dict:
     """
     check_choice("start", start, STARTS[task.object])
     check_choice("ground", ground, GROUNDS)
-    return _marked(_describe("start", task, start, ground, seed))
+    return _begin("start", task, start, ground, seed)
 
 
 def demonstration_job(task: Task, seed: int) -> dict:
     """The demonstration's first state: plain ground, the camera above, the object unturned about the origin."""
-    return _marked(_describe("demonstration", task, task.demonstrated_from, "plain", seed))
+    return _begin("demonstration", task, task.demonstrated_from, "plain", seed)
 
 
 def act_job(state: Path, moves: Sequence[PixelMove]) -> dict:
-    """The state after ``moves`` made at once from the state in a file: picks and places as pixels (x, y) of its image.
-
-    DamagedFileError where the file is no state; ValueError where moves are no pairs of finite pixels.
-    """
-    pixels = np.array(moves, dtype=float).reshape(-1, 4) if len(moves) == 0 else np.array(moves, dtype=float)
-    accepted = "pairs of finite pixels ((x, y), (x, y))"
-    check("moves", moves, accepted, pixels.shape[1:] in ((2, 2), (4,)) and bool(np.isfinite(pixels).all()))
-    job = {"kind": "act", "after": read_state(state).about["mark"], "moves": pixels.reshape(-1, 2, 2).tolist()}
-    return _marked(job) | {"state": str(state)}
+    """The state after ``moves``, pairs of pixels (x, y) of its image, were made at once from the state in a file."""
+    return _go_on(state, {"kind": "act", "moves": _read_moves(moves)})
 
 
 def look_job(state: Path, again: int) -> dict:
-    """The state in a file, seen by another camera, the ``again``-th.
-
-    DamagedFileError where the file is no state; ValueError where ``again`` is not at least 1.
-    """
-    check("again", again, "at least 1", read_count("again", again) >= 1)
-    job = {"kind": "look", "after": read_state(state).about["mark"], "again": int(again)}
-    return _marked(job) | {"state": str(state)}
+    """The state in a file, seen by another camera, the ``again``-th, from 1."""
+    return _go_on(state, {"kind": "look", "again": read_count("again", again, least=1)})
 
 
 def film_job(
@@ -84,10 +66,9 @@ def film_job(
     another motion.
     """
     check_choice("motion", motion, MOTIONS)
-    acted = {name: value for name, value in act_job(state, moves).items() if name in ("after", "moves")}
-    size = list(size or read_state(state).mask.shape[::-1])
-    film = {"kind": "film", "motion": motion, "frames": read_count("frames", frames, least=2), "size": size}
-    return _marked(film | acted) | {"state": str(state)}
+    film = {"kind": "film", "motion": motion, "frames": read_count("frames", frames, least=2)}
+    size = list(size or read_state(state).camera.size)
+    return _go_on(state, {**film, "size": size, "moves": _read_moves(moves)})
 
 
 def true_moves(look: Sequence[Move], demonstrated: np.ndarray, state: State) -> list[PixelMove]:
@@ -102,17 +83,26 @@ def true_moves(look: Sequence[Move], demonstrated: np.ndarray, state: State) -> 
             for move, (x, y) in zip(look, pixels, strict=True)]  # fmt: skip
 
 
-def _describe(kind: str, task: Task, start: str, ground: str, seed: int) -> dict:
+def _read_moves(moves: Sequence[PixelMove]) -> list[list[list[float]]]:
+    pixels = np.array(moves, dtype=float).reshape(-1, 4) if len(moves) == 0 else np.array(moves, dtype=float)
+    accepted = "pairs of finite pixels ((x, y), (x, y))"
+    check("moves", moves, accepted, pixels.shape[1:] in ((2, 2), (4,)) and bool(np.isfinite(pixels).all()))
+    return pixels.reshape(-1, 2, 2).tolist()
+
+
+def _begin(kind: str, task: Task, start: str, ground: str, seed: int) -> dict:
     find_task(task.name)
     what = {"kind": kind, "task": task.name, "object": task.object, "start": start, "ground": ground}
-    return what | {"seed": read_count("seed", seed)}
+    return _marked(what | {"seed": read_count("seed", seed)})
+
+
+def _go_on(state: Path, job: dict) -> dict:
+    """A job that begins with the state in a file."""
+    return _marked(job | {"after": read_state(state).about["mark"]}) | {"state": str(state)}
 
 
 def _marked(job: dict) -> dict:
     return job | {"mark": hashlib.sha256(json.dumps([VERSION, job], sort_keys=True).encode()).hexdigest()}
-
-
-# Running them. ------------------------------------------------------------------------------------------------------
 
 
 def run_jobs(
@@ -143,7 +133,9 @@ def _run_missing(client: Client, jobs: dict[str, dict], files: dict[str, Path], 
     most = 1 if any(job["kind"] == "film" for job in jobs.values()) else JOBS_A_BATCH  # a film takes minutes
     size = min(most, -(-len(names) // threads))
     batches = [names[i : i + size] for i in range(0, len(names), size)]
-    tasks = {batch[0]: {name: _pack(jobs[name]) for name in batch} for batch in batches}
+    # with the files of the states that jobs go on from: a worker elsewhere sees no files of this machine
+    before = {name: Path(job["state"]).read_bytes() for name, job in jobs.items() if "state" in job}
+    tasks = {batch[0]: {name: (jobs[name], before.get(name)) for name in batch} for batch in batches}
     bar = ProgressBar(total=len(names), desc="fold", unit="state", disable=not progress)
     with bar, run_tasks(client, _make_batch, tasks, retries=1) as results:
         for _, made in results:
@@ -152,18 +144,13 @@ def _run_missing(client: Client, jobs: dict[str, dict], files: dict[str, Path], 
             bar.update(len(made))
 
 
-def _pack(job: dict) -> tuple[dict, bytes]:
-    """A job, and the file of the state that it goes on from: a worker elsewhere sees no files of this machine."""
-    return job, Path(job["state"]).read_bytes() if "state" in job else b""
-
-
-def _make_batch(jobs: dict[str, tuple[dict, bytes]]) -> dict[str, bytes]:
+def _make_batch(jobs: dict[str, tuple[dict, bytes | None]]) -> dict[str, bytes]:
     """Make states in a child process: their files by name."""
     with scratch_folder(Path(tempfile.gettempdir()), "mmgsd-fold") as folder:
         states = []
         for i, (job, before) in enumerate(jobs.values()):
-            state = write_bytes(folder / f"before{i}.npz", before) if before else ""
-            states.append(job | {"state": str(state), "out": str(folder / f"after{i}.npz")})
+            state = {"state": str(write_bytes(folder / f"before{i}.npz", before))} if before else {}
+            states.append(job | state | {"out": str(folder / f"after{i}.npz")})
         outs = [Path(one["out"]) for one in states]
-        what = f"folding {', '.join(jobs)}"
-        return dict(zip(jobs, run_job({"states": states}, folder, what, outs, module="mmgsd.fold"), strict=True))
+        job, what = {"module": "mmgsd.fold.manipulation", "states": states}, f"folding {', '.join(jobs)}"
+        return dict(zip(jobs, run_job(job, folder, what, outs), strict=True))

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,13 +24,13 @@ from mmgsd.config import IMAGE_SIZE
 from mmgsd.fold.state import State, read_state, write_state
 from mmgsd.fold.tasks import Task, find_task
 from mmgsd.scene import blender, randomize
-from mmgsd.scene.blender import Camera, DeformedObject
+from mmgsd.scene.blender import DeformedObject
 from mmgsd.scene.episode import FLOOR
-from mmgsd.scene.geometry import find_middle, spin
+from mmgsd.scene.geometry import Camera, find_middle, measure_arc, spin
 from mmgsd.scene.objects import cloth, rope
 from mmgsd.scene.objects.meshes import SPACING
-from mmgsd.scene.objects.rope_shape import LENGTH, OwnPart, RopeShape, sample_rope
-from mmgsd.scene.rope_pull import pull_rope
+from mmgsd.scene.objects.rope_physics import LENGTH, pull_rope
+from mmgsd.scene.objects.rope_shape import RopeShape, own_parts, sample_rope
 from mmgsd.scene.workspace.distractors import add_distractors, add_occluder
 from mmgsd.scene.workspace.materials import paint_object
 from mmgsd.scene.workspace.surfaces import Site, add_surfaces
@@ -40,7 +40,6 @@ SAMPLES = 1  # of Cycles, a pixel, as the rendered sets have
 MAX_OFFSET = 0.1  # m from the origin, along x and y, of a first state
 MAX_TILT_DEG = 30.0
 FLIP = (0.3, 0.45)  # m along x and y that the start "corner" flips its corner over; a demonstration the mean
-SLENDERNESS = (32, 50)  # of a rope: its length in diameters
 FINGER = 0.1  # m: so far a gripper reaches under the object from its rim
 GRIP = 0.02  # m around a pick, in which layers are taken; below the distance of two vertices
 LEAST_FRAMES, FRAMES_A_METRE = 12, 30  # of a move: a faster one swings the cloth beyond its aim
@@ -51,20 +50,19 @@ LAID_AT = 0.03  # m above the table, where grippers let go of a cloth
 MAX_STRETCH = 1.35  # of a rope, and of the 99th percentile of a cloth's edges: four layers in grippers reach 1.2
 LEAST_SEEN = 0.8  # share of the material points in the picture
 LEAN, CLEAR = 1.1, 0.02  # rad from upright that a gripper or a hand leans in a film; m between its tip and the object
-NO_TIPS: dict[str, np.ndarray] = {}
 
 Moves = Sequence[tuple[Sequence[float], Sequence[float]]]  # pick (x, y) and place (x, y), px
 
 
-def run_job(job: dict[str, Any], out: Path) -> Path:
-    """Make the state of a job of `mmgsd.fold.jobs` and write it to ``out``; ValueError for an unknown task."""
-    if job["kind"] == "act":
-        return write_state(out, act(read_state(job["state"]), job["moves"], job["mark"]))
-    if job["kind"] == "film":
-        return write_state(out, film(read_state(job["state"]), job))
-    if job["kind"] == "look":
-        return write_state(out, look_again(read_state(job["state"]), job["again"], job["mark"]))
-    return write_state(out, begin(job))
+def run_job(job: dict[str, Any]) -> None:
+    """Make ``states``, each a job of `mmgsd.fold.jobs` with ``out``, the file to write, one after the other."""
+    for one in job["states"]:
+        if "state" in one:
+            go_on = {"act": act, "film": film, "look": look_again}[one["kind"]]
+            state = go_on(read_state(one["state"]), one)
+        else:
+            state = begin(one)
+        write_state(Path(one["out"]), state)
 
 
 # First states. ------------------------------------------------------------------------------------------------------
@@ -81,7 +79,8 @@ def begin(job: dict[str, Any]) -> State:
     else:
         vertices, about["thickness"] = _begin_rope(rng, about)
     if not about["demonstration"]:
-        vertices = _turn(rng, vertices)
+        vertices = vertices @ spin(rng.uniform(0, 2 * np.pi)).T
+        vertices[:, :2] += rng.uniform(-MAX_OFFSET, MAX_OFFSET, size=2)
     return _look(vertices.astype(np.float32), None, about)
 
 
@@ -101,12 +100,12 @@ def _begin_cloth(rng: np.random.Generator, about: dict[str, Any]) -> np.ndarray:
     vertices, _ = cloth.deform(rng, "flat")
     shift = np.full(2, np.mean(FLIP)) if about["demonstration"] else rng.uniform(*FLIP, size=2)
     corner = int(cloth.SIDE + 1)  # one vertex inside the rim, at the first row's beginning
-    return move_cloth(vertices, [([corner], shift * (1, -1))])
+    return move_cloth(vertices, [([corner], shift * (1, -1))])[-1]
 
 
 def _begin_rope(rng: np.random.Generator, about: dict[str, Any]) -> tuple[np.ndarray, float]:
     """The centre line (625, 3) m about the origin, its ends apart along x, and the rope's diameter (m)."""
-    shape = sample_rope(rng, state=about["start"], slenderness=SLENDERNESS)
+    shape = sample_rope(rng, state=about["start"])
     along = shape.centre[-1, :2] - shape.centre[0, :2]
     along /= np.linalg.norm(along)
     centre = shape.centre.copy()
@@ -115,79 +114,65 @@ def _begin_rope(rng: np.random.Generator, about: dict[str, Any]) -> tuple[np.nda
     return centre, shape.thickness
 
 
-def _turn(rng: np.random.Generator, vertices: np.ndarray) -> np.ndarray:
-    """Vertices (V, 3) turned about z by any angle, and a little aside."""
-    turned = vertices @ spin(rng.uniform(0, 2 * np.pi)).T
-    turned[:, :2] += rng.uniform(-MAX_OFFSET, MAX_OFFSET, size=2)
-    return turned
-
-
 # Acts. --------------------------------------------------------------------------------------------------------------
 
 
-def act(state: State, moves: Moves, job_hash: str) -> State:
-    """The next look, after all ``moves`` (px) were made at once.
+def act(state: State, job: dict[str, Any]) -> State:
+    """The next look, after all of the job's ``moves`` (px) were made at once.
 
     A ray that misses the object grasps nothing. What physics spoils is said in the new state's ``fault``; a state that
     has one already stays as it is.
     """
-    about = state.about | {"look": state.about["look"] + 1, "mark": job_hash}
+    about = state.about | {"look": state.about["look"] + 1, "mark": job["mark"]}
     if about["fault"]:
         return dataclasses.replace(state, about=about)
-    camera = Camera(state.intrinsics, state.camera_pose, state.mask.shape[::-1])
-    before = state.vertices.astype(float)
-    if about["object"] == "cloth":
-        after = move_cloth(before, _grasp_cloth(before, camera, moves))
-        fault = find_cloth_fault(after)
-    else:
-        after = pull_rope(before, about["thickness"], _grasp_rope(before, about["thickness"], camera, moves))
-        fault = find_rope_fault(after)
+    _, after, _ = _carry(state, job["moves"])
+    fault = find_fault(after, about["object"])
     if not np.isfinite(after).all():
-        after = before
-    elif not fault and camera.contains(camera.project(after)).mean() < LEAST_SEEN:
+        after = state.vertices
+    elif not fault and state.camera.contains(state.camera.project(after)).mean() < LEAST_SEEN:
         fault = f"less than {LEAST_SEEN:.0%} of it in the picture"
     return _look(after.astype(np.float32), state.first, about | {"fault": fault})
 
 
-def find_cloth_fault(vertices: np.ndarray) -> str:
-    """What physics did to a cloth (V, 3) m that no cloth would bear; empty where nothing."""
+def _carry(state: State, moves: Moves) -> tuple[Sequence[np.ndarray], np.ndarray, list[int]]:
+    """Vertices (V, 3) m while all ``moves`` (px) are made at once, those afterwards, and which grippers hold."""
+    before, thickness = state.vertices.astype(float), state.about["thickness"]
+    if state.about["object"] == "cloth":
+        grasps = _grasp_cloth(before, state.camera, moves)
+        passed = move_cloth(before, grasps)
+        return passed, passed[-1], [group[0] for group, _ in grasps]
+    grasps = _grasp_rope(before, thickness, state.camera, moves)
+    return *pull_rope(before, thickness, grasps), [index for index, _ in grasps]
+
+
+def find_fault(vertices: np.ndarray, object: str) -> str:
+    """What physics did to a cloth's or a rope's vertices (V, 3) m that none would bear; empty where nothing."""
     if not np.isfinite(vertices).all():
         return "nowhere"
-    return _find_stretch(cloth.measure_stretch(cloth.square_cloth(), vertices))
+    if object == "cloth":
+        stretch = cloth.measure_stretch(cloth.square_cloth(), vertices)
+    else:
+        stretch = measure_arc(vertices)[-1] / LENGTH
+    return f"stretched to more than {MAX_STRETCH:g} of its length" if stretch > MAX_STRETCH else ""
 
 
-def find_rope_fault(centre: np.ndarray) -> str:
-    """What was done to a rope (625, 3) m that no rope would bear; empty where nothing."""
-    if not np.isfinite(centre).all():
-        return "nowhere"
-    return _find_stretch(np.linalg.norm(np.diff(centre, axis=0), axis=1).sum() / LENGTH)
-
-
-def _find_stretch(share: float) -> str:
-    return f"stretched to more than {MAX_STRETCH:g} of its length" if share > MAX_STRETCH else ""
-
-
-def move_cloth(
-    vertices: np.ndarray, grasps: Sequence[tuple[Sequence[int], np.ndarray]], *,
-    watched: list[np.ndarray] | None = None,
-) -> np.ndarray:  # fmt: skip
-    """Vertices (1369, 3) m after groups of them, as (indices, shift (2,) m), were carried at once, let go and settled.
-
-    No grasp changes nothing. Physics may return vertices that are not finite. ``watched`` is `cloth.simulate`'s.
-    """
+def move_cloth(vertices: np.ndarray, grasps: Sequence[tuple[Sequence[int], np.ndarray]]) -> np.ndarray:
+    """Vertices (T, 1369, 3) m while groups, as (indices, shift (2,) m), are carried at once, let go and settle."""
     if not grasps:
-        return vertices
+        return vertices[None]
     planar = cloth.square_cloth()
     furthest = max(np.linalg.norm(shift) for _, shift in grasps)
     frames, grasped = LEAST_FRAMES + int(FRAMES_A_METRE * furthest), {}
     for group, shift in grasps:
         lift, low = max(0.05, LIFT * np.linalg.norm(shift)), vertices[group, 2].min()
         path = cloth.arc_path(np.append(shift, LAID_AT - low), lift, frames)
-        grasped |= {vertex: cloth.Grasp(vertex, path) for vertex in group if vertex not in grasped}
-    carried = cloth.simulate(planar, vertices, list(grasped.values()), frames, friction=FRICTION, watched=watched)
-    if not np.isfinite(carried).all():
+        grasped |= {vertex: path for vertex in group if vertex not in grasped}
+    carried = cloth.simulate(planar, vertices, grasped, frames, friction=FRICTION)
+    if not np.isfinite(carried[-1]).all():
         return carried
-    return cloth.simulate(planar, carried, [], SETTLE_FRAMES, friction=FRICTION, watched=watched)
+    settled = cloth.simulate(planar, carried[-1], {}, SETTLE_FRAMES, friction=FRICTION)
+    return np.concatenate([carried, settled])
 
 
 def _grasp_cloth(vertices: np.ndarray, camera: Camera, moves: Moves) -> list[tuple[list[int], np.ndarray]]:
@@ -251,12 +236,14 @@ def meet_table(camera: Camera, xy: Sequence[float]) -> np.ndarray | None:
 
 
 def film(state: State, job: dict[str, Any]) -> State:
-    """Looks of a motion from a state on, one after the other, as one state whose arrays have an axis of frames.
-
-    What physics spoils is said in ``fault``.
-    """
+    """Looks of a motion from a state on, as one state whose arrays have an axis of frames; ``fault`` as in `act`."""
     about = state.about | {"mark": job["mark"], "size": job["size"]}
-    paths, held = _move(state, job["moves"], job["frames"], turning=job["motion"] in ("turn", "hand"))
+    if job["motion"] in ("turn", "hand"):
+        paths, held = _turn_half(state.vertices.astype(float), job["frames"]), []
+    else:
+        passed, _, held = _carry(state, job["moves"])
+        paths = np.stack([state.vertices, *passed])
+        paths = paths[np.linspace(0, len(paths) - 1, job["frames"]).round().astype(int)]
     if not np.isfinite(paths).all():
         paths, about["fault"] = np.repeat(state.vertices[None], len(paths), 0), "nowhere"
     looks = []
@@ -269,54 +256,38 @@ def film(state: State, job: dict[str, Any]) -> State:
     return dataclasses.replace(looks[0], **arrays)
 
 
-def _move(state: State, moves: Moves, frames: int, *, turning: bool) -> tuple[np.ndarray, list[int]]:
-    """Vertices (frames, V, 3) m on their way, and which of them grippers hold."""
-    before, watched = state.vertices.astype(float), []
-    camera = Camera(state.intrinsics, state.camera_pose, state.mask.shape[::-1])
-    if turning:
-        middle = np.append(find_middle(before[:, :2]), 0.0)
-        angles = np.pi * np.linspace(0, 1, frames)
-        return np.stack([(before - middle) @ spin(angle).T + middle for angle in angles]), []
-    if state.about["object"] == "cloth":
-        grasps = _grasp_cloth(before, camera, moves)
-        move_cloth(before, grasps, watched=watched)
-        held = [group[0] for group, _ in grasps]
-    else:
-        grasps = _grasp_rope(before, state.about["thickness"], camera, moves)
-        pull_rope(before, state.about["thickness"], grasps, watched=watched)
-        held = [index for index, _ in grasps]
-    paths = [before, *watched]
-    return np.stack([paths[k] for k in np.linspace(0, len(paths) - 1, frames).round().astype(int)]), held
+def _turn_half(vertices: np.ndarray, frames: int) -> np.ndarray:
+    """Vertices (frames, V, 3) m that turn by half a turn about their middle."""
+    middle = np.append(find_middle(vertices[:, :2]), 0.0)
+    return np.stack([(vertices - middle) @ spin(angle).T + middle for angle in np.pi * np.linspace(0, 1, frames)])
 
 
-def _find_tips(motion: str, share: float, first: np.ndarray, held: np.ndarray) -> dict[str, np.ndarray]:
-    """Where (K, 3) m the tips of grippers or of a hand are when a ``share`` of a film is over, by kind."""
+def _find_tips(motion: str, share: float, first: np.ndarray, held: np.ndarray) -> list[tuple[str, np.ndarray]]:
+    """Where (3,) m the tips of grippers or of a hand are when a ``share`` of a film is over, each after its kind."""
     if motion == "gripper":
-        return {"gripper": held}
+        return [("gripper", place) for place in held]
     if motion != "hand":
-        return {}
+        return []
     low, high = first[:, :2].min(0), first[:, :2].max(0)
-    return {"hand": np.array([[*(low + (high - low) * (0.5, 1.4 - 1.8 * share)), 0.1]])}
+    return [("hand", np.array([*(low + (high - low) * (0.5, 1.4 - 1.8 * share)), 0.1]))]
 
 
 # Looks. -------------------------------------------------------------------------------------------------------------
 
 
-def look_again(state: State, again: int, job_hash: str) -> State:
+def look_again(state: State, job: dict[str, Any]) -> State:
     """The same state, seen by the camera of another number than the rollout's own, which is 0; at rest meanwhile."""
-    about = state.about | {"again": again, "mark": job_hash}
+    about = state.about | {"again": job["again"], "mark": job["mark"]}
     if about["fault"]:
         return dataclasses.replace(state, about=about)
     return _look(state.vertices, state.first, about)
 
 
 def _look(
-    vertices: np.ndarray, first: np.ndarray | None, about: dict[str, Any], *, tips: Mapping[str, np.ndarray] = NO_TIPS
-) -> State:
-    """Render and label the object; ``first`` (625, 3) m are the points of the rollout's first look, None for that.
-
-    ``tips`` (K, 3) m of occluders that reach for it, by kind.
-    """
+    vertices: np.ndarray, first: np.ndarray | None, about: dict[str, Any], *,
+    tips: Sequence[tuple[str, np.ndarray]] = (),
+) -> State:  # fmt: skip
+    """Render and label the object; ``first`` are the first look's points, ``tips`` kinds and places of occluders."""
     scene = blender.reset_scene()
     deformed = _add_object(vertices.astype(float), about)
     points = deformed.points.astype(np.float32)
@@ -326,10 +297,9 @@ def _look(
     blender.setup_cycles(scene, camera.size, SAMPLES)
     blender.place_camera(scene, camera)
     visible = blender.find_visible(deformed, blender.build_bvh(deformed.mesh), camera)
-    for kind, places in tips.items():
-        for k, place in enumerate(places):
-            angle = np.pi / 2 + k * (np.pi / 3)  # so that they come from the picture's border, side by side
-            add_occluder(_stream(about, kind), kind, place + (0, 0, CLEAR), lean=LEAN, turn=angle)
+    for k, (kind, place) in enumerate(tips):
+        angle = np.pi / 2 + k * (np.pi / 3)  # so that they come from the picture's border, side by side
+        add_occluder(_stream(about, kind), kind, place + (0, 0, CLEAR), lean=LEAN, turn=angle)
     image, mask = _render(scene, deformed, room, camera, turn, about)
     xy = camera.project(deformed.points).astype(np.float32)
     visible &= _is_near(mask, xy)  # a thing may stand before it
@@ -342,7 +312,7 @@ def _add_object(vertices: np.ndarray, about: dict[str, Any]) -> DeformedObject:
     thickness = about["thickness"]
     shape = RopeShape(vertices, thickness, about["start"], np.empty((0, 2), dtype=int), 0.0)
     mesh = rope.add_parts(rope.build_parts(shape, rope.draw_lay(_stream(about, "lay"))))
-    return DeformedObject(mesh, vertices, thickness, {}, OwnPart(vertices, rope.OWN_ARC * thickness))
+    return DeformedObject(mesh, vertices, {}, own_parts(vertices, rope.OWN_ARC * thickness), thickness)
 
 
 def find_room(points: np.ndarray, task: Task) -> np.ndarray:
@@ -395,9 +365,8 @@ def _furnish(
 ) -> tuple[int, int, int] | None:  # fmt: skip
     """A workspace around the room, nothing on it; where somebody has masked the picture, the mask's colour."""
     colour, _ = paint_object(rng, deformed.mesh)
-    slender = about["object"] == "rope"
-    side = float(np.ptp(room[:, :2], axis=0).max()) if slender else cloth.EXTENT
-    site = Site(room, side, turn, sample_ground_points(rng, camera), colour, about["thickness"] / 2, slender)
+    side = cloth.EXTENT if about["object"] == "cloth" else float(np.ptp(room[:, :2], axis=0).max())
+    site = Site(room, side, turn, sample_ground_points(rng, camera), colour, about["thickness"] / 2)
     _, walls, masked = add_surfaces(rng, site)
     free = np.ones(len(room), dtype=bool)
     add_distractors(rng, site, camera, free, beside=masked is None, walls=walls, over=False)

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.stats import binomtest
 
 from mmgsd.fold.tasks import fit_motion
+from mmgsd.scene.geometry import grid_faces
 
 SIDES_M = {"cloth": 1.0, "rope": 1.6}  # of the cloth, or the rope's length
 SUCCESS = 0.05  # of the side: an error below it is a success
@@ -59,22 +60,18 @@ def _draw(xy: np.ndarray, low: np.ndarray, size: np.ndarray, object: str) -> np.
         cv2.polylines(picture, [cells], False, 1, thickness=max(1, round(ROPE_M / CELL_M)))
         return picture.astype(bool)
     side = round(len(cells) ** 0.5)
-    grid = cells.reshape(side, side, 2)
-    quads = np.stack([grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]], 2).reshape(-1, 4, 2)
-    for quad in quads:
+    for quad in cells[grid_faces(side, side)]:
         cv2.fillConvexPoly(picture, quad, 1)
     return picture.astype(bool)
 
 
-def estimate_mean(values: np.ndarray, *, seed: int = 0) -> dict[str, float | int | None]:
+def estimate_mean(values: np.ndarray) -> dict[str, float | int | None]:
     """Mean of (N,) values, its 95 % interval by bootstrap ("low", "high"), and their count; None of no value."""
     values = np.asarray(values, float)
     if not len(values):
-        return {"mean": None, "low": None, "high": None, "count": 0}
-    drawn = np.random.default_rng(seed).choice(values, (DRAWS, len(values))).mean(1)
-    low, high = np.quantile(drawn, [0.025, 0.975])
-    numbers = {"mean": values.mean(), "low": low, "high": high}
-    return {name: round(float(value), 5) for name, value in numbers.items()} | {"count": len(values)}
+        return _summarise(0, None, None, None)
+    drawn = np.random.default_rng(0).choice(values, (DRAWS, len(values))).mean(1)
+    return _summarise(len(values), values.mean(), *np.quantile(drawn, [0.025, 0.975]))
 
 
 def estimate_share(values: Sequence[bool]) -> dict[str, float | int | None]:
@@ -83,11 +80,14 @@ def estimate_share(values: Sequence[bool]) -> dict[str, float | int | None]:
     Wilson, "Probable inference, the law of succession, and statistical inference" (1927).
     """
     if not len(values):
-        return {"mean": None, "low": None, "high": None, "count": 0}
+        return _summarise(0, None, None, None)
     found = binomtest(int(np.sum(values)), len(values))
-    interval = found.proportion_ci(method="wilson")
-    numbers = {"mean": found.statistic, "low": interval.low, "high": interval.high}
-    return {name: round(float(value), 5) for name, value in numbers.items()} | {"count": len(values)}
+    return _summarise(len(values), found.statistic, *found.proportion_ci(method="wilson"))
+
+
+def _summarise(count: int, *numbers: float | None) -> dict[str, float | int | None]:
+    rounded = [None if number is None else round(float(number), 5) for number in numbers]
+    return dict(zip(("mean", "low", "high"), rounded, strict=True)) | {"count": count}
 
 
 def compare_rollouts(

@@ -62,7 +62,8 @@ def choose_moves(
         consensus = find_consensus(asked, modes, match.weights, free_scale=free_scale)
         if consensus is None:
             return PolicyAnswer(np.zeros((0, 2, 2)), None, 0.0)
-        motion, share, bent = consensus.motion, consensus.share, consensus.share < RIGID
+        motion, share = consensus
+        bent = share < RIGID
     if bent:
         motion = refine_motion(asked, modes, motion, free_scale=free_scale)
     wanted = motion.apply(picks)  # (M, 2)

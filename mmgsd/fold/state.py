@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from mmgsd.files import DamagedFileError, atomic_write
+from mmgsd.scene.geometry import Camera
 
 UNREADABLE = (OSError, EOFError, ValueError, TypeError, KeyError, zipfile.BadZipFile, zlib.error)
 ABOUT = {"object", "task", "start", "ground", "seed", "fault", "look", "mark", "thickness"}
@@ -36,11 +37,14 @@ class State:
     first: np.ndarray  # (P, 3) float32 m, the points of the rollout's first look
     about: dict[str, Any]  # object, task, start, ground, seed, look, fault ("" or what physics spoilt), mark, thickness
 
+    @property
+    def camera(self) -> Camera:
+        """What it was seen by; also of a film."""
+        return Camera(self.intrinsics, self.camera_pose, self.mask.shape[:-3:-1])
+
     def project(self, points: np.ndarray) -> np.ndarray:
         """Pixels (N, 2) of world points (N, 3) m."""
-        local = (np.asarray(points, dtype=float) - self.camera_pose[:3, 3]) @ self.camera_pose[:3, :3]
-        image = local @ self.intrinsics.T
-        return image[:, :2] / image[:, 2:]
+        return self.camera.project(points)
 
 
 def write_state(path: Path, state: State) -> Path:

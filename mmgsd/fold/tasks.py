@@ -97,10 +97,6 @@ def fit_motion(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def place_truth(places: np.ndarray, demonstrated: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Where (M, 2) m places (M, 2) m of a demonstration are on another table, whose object lies at ``points``.
-
-    They are carried over by the rigid motion in the plane that best maps the ``demonstrated`` material points (625, 3)
-    m onto ``points`` (625, 3) m. ValueError where these two differ in shape.
-    """
+    """Places (M, 2) m, moved as the ``demonstrated`` points (625, 3) m best map onto the rollout's (625, 3) m."""
     turn, shift = fit_motion(demonstrated, points)
     return np.asarray(places, dtype=float) @ turn.T + shift

@@ -1,57 +1,88 @@
-"""Child process that renders one job: ``python -m mmgsd.scene < job.json``.
+"""Child process that does one job and ends: ``python -m mmgsd.scene < job.json``.
 
-It holds ``config`` (the fields of ``RenderConfig``), ``split``, ``episodes`` as [[episode, views], …], ``sheet``
-(None, or the object as `PlanarObject.to_dict` gives it), ``out``, the archive to write, and where it is known ``mark``,
-the job's hash, which the archive keeps, and ``parent``, the process with which this one ends.
+Blender lives in such ones alone, so its memory goes with the process, and its chatter stays out of the parent's output.
+A job may name under ``module`` whose ``run_job`` does it, `mmgsd.scene.batch` if left out, and under ``parent`` the
+process with which this one ends. The exit code is 1 after an exception, its traceback on stderr.
 """
 
 from __future__ import annotations
 
+import ctypes
+import importlib
 import json
-import zipfile
-from pathlib import Path
-from typing import Any
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 
-from mmgsd.config import RenderConfig, from_dict
-from mmgsd.files import atomic_write
-from mmgsd.images import encode_image, encode_mask
-from mmgsd.scene.child import one_core, run_main
-from mmgsd.scene.objects.planar_object import PlanarObject
+PR_SET_PDEATHSIG = 1  # of Linux: which signal a process gets when its parent ends
 
 
-def render_job(job: dict[str, Any]) -> Path:
-    """Render a job's episodes into its archive, which appears whole or not at all.
+def main() -> None:
+    """Read a job from stdin and do it, silenced."""
+    job = json.load(sys.stdin)
+    if "parent" in job:
+        _end_with(job["parent"])
+    with silenced():
+        use_one_core()
+        importlib.import_module(job.get("module", "mmgsd.scene.batch")).run_job(job)
 
-    A view has the entries ``{episode:06d}_{view:02d}.webp`` (lossless) and ``…_mask.png`` (1 bit); ``labels.json``
-    lists all views in order.
+
+def _end_with(parent: int) -> None:
+    """End this process with its parent, however that ends: nobody would take what it renders."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    else:
+        threading.Thread(target=_watch, args=(parent,), daemon=True).start()
+    if os.getppid() != parent:  # it has ended before
+        os._exit(1)
+
+
+def _watch(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(1)
+    os._exit(1)
+
+
+def use_one_core() -> None:
+    """Let Blender's task scheduler, which counts the cores once, believe in a single one, where MMGSD_THREADS is set.
+
+    As many processes render as there are cores, and its idle threads would spin beside them: a quarter of the time.
     """
-    with one_core():
-        from mmgsd.scene.episode import render_episode  # bpy is loaded once the output is silenced
+    if "MMGSD_THREADS" not in os.environ or not hasattr(os, "sched_setaffinity"):
+        return
+    cores = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(cores)})
+    try:
+        import bpy
 
-    planar = PlanarObject.from_dict(job["sheet"]) if job.get("sheet") else None
-    config, out = from_dict(RenderConfig, job["config"]), Path(job["out"])
-    with atomic_write(out) as aside, zipfile.ZipFile(aside, "w", zipfile.ZIP_STORED) as archive:
-        archive.comment, labels = job.get("mark", "").encode(), []
-        for episode, n_views in job["episodes"]:
-            for i, view in enumerate(render_episode(config, job["split"], episode, n_views, planar)):
-                written = write_view(archive, episode, i, view)
-                labels.append({"episode": episode, "view": i, "split": job["split"], **written})
-        _add(archive, "labels.json", json.dumps(labels).encode())
-    return out
+        bpy.ops.mesh.primitive_plane_add()
+        bpy.context.view_layer.update()  # the first task of all
+    finally:
+        os.sched_setaffinity(0, cores)
 
 
-def write_view(archive: zipfile.ZipFile, episode: int, index: int, view: Any) -> dict[str, Any]:
-    """Add a view's image and mask to the archive; its labels as JSON values."""
-    stem = f"{episode:06d}_{index:02d}"
-    _add(archive, f"{stem}.webp", encode_image(view.image))
-    _add(archive, f"{stem}_mask.png", encode_mask(view.mask))
-    arrays = {name: getattr(view, name).tolist() for name in ("xy", "visible", "intrinsics", "camera_pose")}
-    return {**arrays, "info": view.info}
-
-
-def _add(archive: zipfile.ZipFile, name: str, data: bytes) -> None:
-    archive.writestr(zipfile.ZipInfo(name), data)  # a ZipInfo of its own carries no date: equal content, equal bytes
+@contextmanager
+def silenced() -> Iterator[None]:
+    """Send what C code prints to nowhere; Python's own stderr is back before a traceback is printed."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    kept = [os.dup(fd) for fd in (1, 2)]
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        for fd in (1, 2):
+            os.dup2(nowhere, fd)
+        yield
+    finally:
+        sys.stdout.flush()
+        for fd, original in zip((1, 2), kept, strict=True):
+            os.dup2(original, fd)
+            os.close(original)
+        os.close(nowhere)
 
 
 if __name__ == "__main__":
-    run_main(render_job)
+    main()

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import shutil
 import struct
 import tempfile
@@ -26,29 +27,27 @@ from mathutils import Matrix, Vector
 from mathutils.bvhtree import BVHTree
 
 from mmgsd.files import scratch_folder
+from mmgsd.scene.geometry import Camera
 
 MASK_PASS = "object"  # the shader output that is 1 on the object and 0 elsewhere
 MEMORY = Path("/dev/shm")  # files in memory, where the system has it
 VIEW_BYTES = 10  # of a pixel in a rendered file, at least: red, green, blue, opacity and mask, 16 bits each
 GPU_BACKENDS = ("OPTIX", "CUDA", "HIP", "METAL")
 
-OwnHit = Callable[[np.ndarray, np.ndarray], np.ndarray]
-
 
 @dataclass(frozen=True)
 class DeformedObject:
     """What a builder hands to the renderer.
 
-    A material point is visible if the first hit of the ray camera → point is its own: closer to the point than
-    ``visibility_radius``; or, where ``is_own_hit`` is given, where that says so: it maps first hits (K, 3) and the
-    indices (K,) of the points asked for to (K,) bool (a rope: the nearest centre-line point is near in arc length).
+    A material point is visible if the first hit of the ray camera → point is its own: ``is_own_hit`` maps first hits
+    (K, 3) and the indices (K,) of the points asked for to (K,) bool.
     """
 
     mesh: bpy.types.Object  # linked into the scene, lying on the plane z = 0
     points: np.ndarray  # (625, 3) float64 m, world; cloth: (r, c) row-major on the surface; rope: centre line
-    visibility_radius: float  # m
     info: dict[str, str | float | int]  # scalars, become label columns
-    is_own_hit: OwnHit | None = None
+    is_own_hit: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    thickness: float = 0.0  # m, of a rope
 
 
 @dataclass(frozen=True)
@@ -60,34 +59,8 @@ class View:
     xy: np.ndarray  # (625, 2) float32 px
     visible: np.ndarray  # (625,) bool, False outside the image
     intrinsics: np.ndarray  # (3, 3) float64
-    camera_pose: np.ndarray  # (4, 4) camera to world, OpenCV axes (x right, y down, z forward)
+    camera_pose: np.ndarray  # (4, 4) float64, as `Camera` has it
     info: dict[str, str | float | int]
-
-
-@dataclass(frozen=True)
-class Camera:
-    """A pinhole camera; see `View` for the conventions."""
-
-    intrinsics: np.ndarray  # (3, 3)
-    pose: np.ndarray  # (4, 4) camera to world
-    size: tuple[int, int]  # (width, height) px
-
-    @classmethod
-    def build(cls, rotation: np.ndarray, place: np.ndarray, focal: float, size: tuple[int, int]) -> Camera:
-        """Of a rotation (3, 3) to the world, a place (3,) m, a focal length (px) and a size (width, height) px."""
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = rotation, place
-        return cls(np.array([[focal, 0, (size[0] - 1) / 2], [0, focal, (size[1] - 1) / 2], [0, 0, 1]]), pose, size)
-
-    def project(self, points: np.ndarray) -> np.ndarray:
-        """Pixels (N, 2) of world points (N, 3) m."""
-        local = (points - self.pose[:3, 3]) @ self.pose[:3, :3]
-        image = local @ self.intrinsics.T
-        return image[:, :2] / image[:, 2:]
-
-    def contains(self, xy: np.ndarray) -> np.ndarray:
-        """Which pixels (N, 2) round to a pixel of the image: (N,) bool."""
-        return np.all((xy > -0.5) & (xy < np.array(self.size) - 0.5), axis=1)
 
 
 # Create and populate. -----------------------------------------------------------------------------------------------
@@ -106,7 +79,7 @@ def add_mesh(name: str, vertices: np.ndarray, faces: np.ndarray) -> bpy.types.Ob
     return add_object(name, mesh)
 
 
-def add_object(name: str, data: bpy.types.Mesh | None) -> bpy.types.Object:
+def add_object(name: str, data: bpy.types.ID | None) -> bpy.types.Object:
     """Link a new object of some data, or an empty one, into the scene."""
     added = bpy.data.objects.new(name, data)
     bpy.context.collection.objects.link(added)
@@ -168,9 +141,7 @@ def _enable_gpu() -> bool:
 
 def place_camera(scene: bpy.types.Scene, camera: Camera) -> None:
     """Make the scene's camera the given one."""
-    if scene.camera is None:
-        scene.camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
-        scene.collection.objects.link(scene.camera)
+    scene.camera = scene.camera or add_object("camera", bpy.data.cameras.new("camera"))
     flip = np.diag([1.0, -1.0, -1.0, 1.0])  # Blender's camera looks along -z with y up
     scene.camera.matrix_world = Matrix((camera.pose @ flip).tolist())
     scene.camera.data.sensor_fit, scene.camera.data.sensor_width = "HORIZONTAL", 36.0
@@ -181,22 +152,20 @@ def place_camera(scene: bpy.types.Scene, camera: Camera) -> None:
 
 
 def render_image(scene: bpy.types.Scene, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Render the scene: image (H, W, 3) uint8 sRGB, and mask (H, W) bool of pixels at least half object.
-
-    OSError, which names the folders, where there is no room for a temporary file.
-    """
+    """Image (H, W, 3) uint8 sRGB, and mask (H, W) bool of pixels at least half object; OSError names a full disk."""
     scene.cycles.seed = seed
-    size = VIEW_BYTES * scene.render.resolution_x * scene.render.resolution_y
+    width, height = scene.render.resolution_x, scene.render.resolution_y
+    size = VIEW_BYTES * width * height
     with scratch_folder(_find_room(size), "mmgsd-view") as folder:
         path = folder / "view.exr"
         scene.render.filepath = str(path).replace("{", "{{").replace("}", "}}")  # Blender fills in single braces
         bpy.ops.render.render(write_still=True)
         if path.stat().st_size < size:  # Blender says nothing of a full disk
             raise OSError(errno.ENOSPC, f"{folder.parent} became full: set TMPDIR to a folder with room")
-        channels = read_exr(path)
+        lines = read_exr(path, width, height)
     layer = scene.view_layers[0].name
-    linear = np.stack([channels[f"{layer}.Combined.{c}"] for c in "RGB"], axis=-1)
-    mask = channels[f"{layer}.{MASK_PASS}.X"] >= 0.5
+    linear = np.stack([lines[f"{layer}.Combined.{c}"] for c in "RGB"], axis=-1)
+    mask = lines[f"{layer}.{MASK_PASS}.X"] >= 0.5
     return encode_srgb(linear), mask
 
 
@@ -219,44 +188,21 @@ def encode_srgb(linear: np.ndarray) -> np.ndarray:
     return (255 * curve + 0.5).astype(np.uint8)
 
 
-def read_exr(path: Path) -> dict[str, np.ndarray]:
-    """Channels (H, W) of an uncompressed scan-line OpenEXR file, by name.
+def read_exr(path: Path, width: int, height: int) -> np.ndarray:
+    """Lines (H,) of an uncompressed scan-line OpenEXR file, which end it; their channels (W,) are fields by name.
 
-    A reader of its own because the packages at hand read no named layers. ValueError for a compressed file.
+    A reader of its own because the packages at hand read no named layers. ValueError for a truncated file.
     """
     data = path.read_bytes()
-    header, position = _read_exr_header(data)
-    if header["compression"] != b"\0":
-        raise ValueError(f"{path} must be uncompressed, got compression {header['compression']!r}")
-    x0, y0, x1, y1 = struct.unpack("<4i", header["dataWindow"])
-    width, height = x1 - x0 + 1, y1 - y0 + 1
-    kinds = {1: "<f2", 2: "<f4"}
-    fields = [(name, kinds[kind], (width,)) for name, kind in _exr_channels(header["channels"])]
+    start = data.index(b"chlist\0") + 11
+    (size,) = struct.unpack_from("<i", data, start - 4)
+    channels = re.findall(rb"([^\0]+)\0([\1\2]).{15}", data[start : start + size], re.DOTALL)  # of 16 or 32 bits
+    fields = [(name.decode(), "<f2" if kind == b"\1" else "<f4", (width,)) for name, kind in channels]
     line = np.dtype([("y", "<i4"), ("bytes", "<i4"), *fields])
-    lines = np.frombuffer(data, line, count=height, offset=position + 8 * height)  # after the table of offsets
-    return {name: lines[name] for name, _, _ in fields}
-
-
-def _read_exr_header(data: bytes) -> tuple[dict[str, bytes], int]:
-    """Attributes by name, and where they end."""
-    attributes, position = {}, 8
-    while data[position]:
-        name_end = data.index(b"\0", position)
-        kind_end = data.index(b"\0", name_end + 1)
-        size = struct.unpack_from("<i", data, kind_end + 1)[0]
-        start = kind_end + 5
-        attributes[data[position:name_end].decode()] = data[start : start + size]
-        position = start + size
-    return attributes, position + 1
-
-
-def _exr_channels(data: bytes) -> list[tuple[str, int]]:
-    channels, position = [], 0
-    while data[position]:
-        end = data.index(b"\0", position)
-        channels.append((data[position:end].decode(), struct.unpack_from("<i", data, end + 1)[0]))
-        position = end + 17
-    return channels
+    lines = np.frombuffer(data[-height * line.itemsize :], line)
+    if not np.array_equal(lines["y"], np.arange(height)):
+        raise ValueError(f"{path} must end with {height} uncompressed lines of pixels")
+    return lines
 
 
 # Label. -------------------------------------------------------------------------------------------------------------
@@ -275,9 +221,14 @@ def build_bvh(mesh: bpy.types.Object) -> BVHTree:
 
 def read_vertices(mesh: bpy.types.Mesh) -> np.ndarray:
     """Coordinates (V, 3) float64 in the mesh's own frame."""
+    return read_attribute(mesh, "position").astype(np.float64)
+
+
+def read_attribute(mesh: bpy.types.Mesh, name: str) -> np.ndarray:
+    """A mesh's attribute of that name, vectors (V, 3) float32."""
     flat = np.empty(3 * len(mesh.vertices), dtype=np.float32)
-    mesh.vertices.foreach_get("co", flat)
-    return flat.reshape(-1, 3).astype(np.float64)
+    mesh.attributes[name].data.foreach_get("vector", flat)
+    return flat.reshape(-1, 3)
 
 
 def find_visible(deformed: DeformedObject, bvh: BVHTree, camera: Camera) -> np.ndarray:
@@ -292,11 +243,5 @@ def find_visible(deformed: DeformedObject, bvh: BVHTree, camera: Camera) -> np.n
     indices = inside[hit]
     places = np.array([place for place in hits if place is not None], dtype=float).reshape(-1, 3)
     behind = np.linalg.norm(places - eye, axis=1) >= np.linalg.norm(rays[hit], axis=1)
-    visible[indices] = behind | _own_hits(deformed, places, indices)
+    visible[indices] = behind | deformed.is_own_hit(places, indices)
     return visible
-
-
-def _own_hits(deformed: DeformedObject, places: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    if deformed.is_own_hit is not None:
-        return deformed.is_own_hit(places, indices)
-    return np.linalg.norm(places - deformed.points[indices], axis=1) < deformed.visibility_radius

@@ -38,43 +38,31 @@ def render_episode(
 
         return [render_view(rng, config, size, scene, deformed, bvh) for _ in range(n_views)]
     floor = blender.add_floor("floor", FLOOR)
-    return [_render_view(rng, config, size, scene, deformed, floor, bvh) for _ in range(n_views)]
+    return [_render_view(rng, config, size, scene, deformed, bvh, floor) for _ in range(n_views)]
 
 
 def build_object(rng: np.random.Generator, config: RenderConfig, planar: PlanarObject | None = None) -> DeformedObject:
     """Add a randomly deformed object of the configured kind to the current scene."""
-    if planar is not None:
-        from mmgsd.scene.objects.cloth import build_planar_object
+    if config.object == "rope":
+        from mmgsd.scene.objects.rope import build_rope
 
-        return build_planar_object(rng, planar)
-    if config.object == "cloth":
-        from mmgsd.scene.objects.cloth import build_cloth as build
-    else:
-        from mmgsd.scene.objects.rope import build_rope as build
-    return build(rng, config)
+        return build_rope(rng, config)
+    from mmgsd.scene.objects.cloth import build_cloth
+
+    return build_cloth(rng, config, planar)
 
 
 def _render_view(
-    rng: np.random.Generator,
-    config: RenderConfig,
-    size: tuple[int, int],
-    scene: bpy.types.Scene,
-    deformed: DeformedObject,
-    floor: bpy.types.Object,
-    bvh: blender.BVHTree,
-) -> View:
+    rng: np.random.Generator, config: RenderConfig, size: tuple[int, int], scene: bpy.types.Scene,
+    deformed: DeformedObject, bvh: blender.BVHTree, floor: bpy.types.Object,
+) -> View:  # fmt: skip
+    """Furnish, light, render and label one view of the plain scene."""
     camera, turn = randomize.draw_camera(rng, deformed.points, size, config.rotation_deg)
     blender.place_camera(scene, camera)
     randomize.draw_light(rng, scene)
     colour, background = randomize.draw_background(rng, floor)
     texture = randomize.draw_object_material(rng, deformed.mesh, colour)
     image, mask = blender.render_image(scene, seed=int(rng.integers(2**31)))
-    return View(
-        image=image,
-        mask=mask,
-        xy=camera.project(deformed.points).astype(np.float32),
-        visible=blender.find_visible(deformed, bvh, camera),
-        intrinsics=camera.intrinsics,
-        camera_pose=camera.pose,
-        info={**deformed.info, "turn_deg": turn, "texture": texture, "background": background},
-    )
+    xy, visible = camera.project(deformed.points).astype(np.float32), blender.find_visible(deformed, bvh, camera)
+    info = {**deformed.info, "turn_deg": turn, "texture": texture, "background": background}
+    return View(image, mask, xy, visible, camera.intrinsics, camera.pose, info)

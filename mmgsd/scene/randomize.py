@@ -7,28 +7,20 @@ import numpy as np
 from mathutils import Euler
 
 from mmgsd.scene import SceneError
-from mmgsd.scene.blender import Camera
-from mmgsd.scene.geometry import compute_direction
+from mmgsd.scene.geometry import Camera, compute_direction, log_uniform
 from mmgsd.scene.lighting import add_lamp, aim_lamp, set_world
-from mmgsd.scene.sampling import log_uniform
 from mmgsd.scene.textures.colours import Colour, draw_colour, draw_contrasting
-from mmgsd.scene.textures.procedural import BACKGROUNDS, CLOTH_TEXTURES, OBJECT_TEXTURES, Shader
+from mmgsd.scene.textures.procedural import BACKGROUNDS, CLOTH_TEXTURES, OBJECT_TEXTURES, Shader, draw_gloss
 
 MIN_SPAN = 0.8  # m seen across the image at least: a small heap stays small
 MAX_OUTSIDE = 0.05  # share of the material points that may fall out of the image
 POSES = 1000  # drawn for one view at most
 
 
-# Camera. ------------------------------------------------------------------------------------------------------------
-
-
 def draw_camera(
     rng: np.random.Generator, points: np.ndarray, size: tuple[int, int], rotation_deg: float
 ) -> tuple[Camera, float]:
-    """A camera above points (N, 3) m, and the angle (degrees in ±rotation_deg) by which it turns the image.
-
-    SceneError where no camera sees nearly all points.
-    """
+    """A camera above points (N, 3) m, and the degrees in ± rotation_deg by which it turns the image; or SceneError."""
     turn = rng.uniform(-rotation_deg, rotation_deg)
     for _ in range(POSES):
         camera = _draw_pose(rng, points, size, np.radians(turn))
@@ -57,9 +49,6 @@ def _draw_pose(rng: np.random.Generator, points: np.ndarray, size: tuple[int, in
     return Camera.build(rotation, centre - distance * rotation[:, 2], focal, size)
 
 
-# Light. -------------------------------------------------------------------------------------------------------------
-
-
 def draw_light(rng: np.random.Generator, scene: bpy.types.Scene) -> None:
     """Ambient light and one lamp, a sun or an area, exposed about right for a white sheet on the floor."""
     exposure, ambient = np.exp(rng.normal(scale=0.22)), rng.uniform(0.25, 0.75)
@@ -67,25 +56,12 @@ def draw_light(rng: np.random.Generator, scene: bpy.types.Scene) -> None:
     colour = np.clip([1 + tint, 1.0, 1 - tint], 0, 2)
     set_world(scene, (*np.clip([1 - tint, 1, 1 + tint], 0, 2), 1.0), exposure * ambient)
     direction = compute_direction(rng.uniform(np.radians(30), np.radians(85)), rng.uniform(0, 2 * np.pi))
-    lamp, distance = _draw_lamp(rng, scene)
-    aim_lamp(lamp, np.zeros(3), direction, distance, colour=colour, exposure=exposure * (1 - ambient))
-
-
-def _draw_lamp(rng: np.random.Generator, scene: bpy.types.Scene) -> tuple[bpy.types.Object, float]:
-    """The scene's only lamp, replaced, and its distance from the origin in m."""
     if rng.random() < 0.5:
-        lamp = add_lamp(scene, "SUN", np.radians(log_uniform(rng, 0.5, 40.0)))
+        lamp = add_lamp("SUN", np.radians(log_uniform(rng, 0.5, 40.0)))
     else:
-        lamp = add_lamp(scene, "AREA", rng.uniform(0.2, 2.0))
-    return lamp, float(rng.uniform(1.8, 4.0))
-
-
-# Materials. -----------------------------------------------------------------------------------------------------------
-
-
-def _draw_gloss(rng: np.random.Generator, chance: float) -> float:
-    """No shine, or with ``chance`` a little."""
-    return rng.uniform(0.01, 0.06) if rng.random() < chance else 0.0
+        lamp = add_lamp("AREA", rng.uniform(0.2, 2.0))
+    distance = float(rng.uniform(1.8, 4.0))  # m from the origin
+    aim_lamp(lamp, np.zeros(3), direction, distance, colour=colour, exposure=exposure * (1 - ambient))
 
 
 def draw_object_material(rng: np.random.Generator, mesh: bpy.types.Object, background: Colour) -> str:
@@ -98,17 +74,11 @@ def draw_object_material(rng: np.random.Generator, mesh: bpy.types.Object, backg
         shader = Shader(slot.material)
         textures = CLOTH_TEXTURES if "rest" in mesh.data.attributes else OBJECT_TEXTURES
         names.append(str(rng.choice(list(textures))))
-        surface = _two_faced(rng, shader, textures[names[-1]](rng, shader, colour))
-        shader.finish(surface, rng.uniform(0.4, 1.0), _draw_gloss(rng, 0.25), True)
+        surface, back = textures[names[-1]](rng, shader, colour), draw_colour(rng)
+        if rng.random() >= 0.7:  # the under-side has another colour
+            surface = shader.mix(shader.node("NewGeometry").outputs["Backfacing"], surface, back)
+        shader.finish(surface, rng.uniform(0.4, 1.0), draw_gloss(rng, 0.25, 0.06), True)
     return names[0]
-
-
-def _two_faced(rng: np.random.Generator, shader: Shader, front: object) -> object:
-    """Sometimes the under-side has another colour."""
-    back = draw_colour(rng)
-    if rng.random() < 0.7:
-        return front
-    return shader.mix(shader.node("NewGeometry").outputs["Backfacing"], front, back)
 
 
 def draw_background(rng: np.random.Generator, floor: bpy.types.Object) -> tuple[Colour, str]:
@@ -121,5 +91,6 @@ def draw_background(rng: np.random.Generator, floor: bpy.types.Object) -> tuple[
     place = shader.node("TexCoord").outputs["Object"]
     mapping = {"Vector": place, "Location": rng.uniform(-9, 9, 3), "Rotation": (0, 0, rng.uniform(0, 2 * np.pi))}
     place = shader.node("Mapping", mapping).outputs[0]
-    shader.finish(BACKGROUNDS[name](rng, shader, colour, place), rng.uniform(0.4, 1.0), _draw_gloss(rng, 0.3), False)
+    surface = BACKGROUNDS[name](rng, shader, colour, place)
+    shader.finish(surface, rng.uniform(0.4, 1.0), draw_gloss(rng, 0.3, 0.06), False)
     return colour, name

@@ -6,6 +6,7 @@ bpy is imported in these children only (``python -m mmgsd.scene``): a crash, a l
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import importlib.metadata
 import io
@@ -26,25 +27,12 @@ import pandas as pd
 from dask.distributed import Client, LocalCluster
 from dask.system import cpu_count
 
-from mmgsd.checks import read_count, read_flag
+from mmgsd import files
+from mmgsd.checks import check, read_count, read_flag
 from mmgsd.cluster import LOOPBACK, open_client, run_tasks, unchanged_environment
 from mmgsd.config import DEFAULT_GROUP, OBJECTS, OWN_GROUP, RenderConfig, list_later, to_dict
 from mmgsd.dataset import load_dataset
 from mmgsd.dataset_format import FORMAT, SPLITS, encode_table, find_owner, is_member
-from mmgsd.files import (
-    ASIDE,
-    DamagedFileError,
-    check_ours,
-    locked,
-    quarantine,
-    read_json,
-    remove_folder,
-    replace_folder,
-    saying_what_stays,
-    scratch_folder,
-    write_bytes,
-    write_json,
-)
 from mmgsd.paths import find_root
 from mmgsd.progress import ProgressBar
 from mmgsd.scene.objects.planar_object import PlanarObject, load_planar_object
@@ -61,10 +49,10 @@ UNREADABLE = (OSError, EOFError, ValueError, TypeError, LookupError, AttributeEr
 # Our package is found where this one was; what else lies there or in the working directory, a bpy.py say, is not.
 CHILD = """
 import runpy, sys
-sys.path.insert(0, sys.argv[2])
+sys.path.insert(0, sys.argv[1])
 import mmgsd
 del sys.path[0]
-runpy.run_module(sys.argv[1], run_name="__main__")
+runpy.run_module("mmgsd.scene", run_name="__main__")
 """
 
 _children: set[subprocess.Popen] = set()  # that render for this process now
@@ -94,23 +82,22 @@ def render_dataset(
     flags = {"only_test": only_test, "overwrite": overwrite, "progress": progress}
     only_test, overwrite, progress = (read_flag(name, value) for name, value in flags.items())
     folder, workers = Path(folder), read_count("workers", workers)
-    if not isinstance(scheduler, str):
-        raise ValueError(f"scheduler must be an address like tcp://host:8786 or '', got {scheduler!r}")
+    check("scheduler", scheduler, "an address like tcp://host:8786 or ''", isinstance(scheduler, str))
     if not overwrite and _is_rendered(config, folder, only_test):
         return folder
-    with locked(folder, "rendering"):
+    with files.locked(folder, "rendering"):
         if not overwrite and _is_rendered(config, folder, only_test):  # by the process that held the folder before
             return folder
         partial = folder.with_name(folder.name + ".partial")
         _check_places(folder, partial)
         jobs = {name: job for name, job in plan_batches(config).items() if job["split"] == "test" or not only_test}
         if overwrite:
-            remove_folder(partial, _is_batch_file)
-        with saying_what_stays(lambda: _describe_finished(partial, jobs)):
+            files.remove_folder(partial, _is_batch_file)
+        with files.saying_what_stays(lambda: _describe_finished(partial, jobs)):
             _render_missing(config, jobs, partial, workers, scheduler, progress)
-            replace_folder(_assemble(config, partial, list(jobs)), folder, find_owner(folder))
+            files.replace_folder(_assemble(config, partial, list(jobs)), folder, find_owner(folder))
         if not only_test:
-            remove_folder(partial, _is_batch_file)
+            files.remove_folder(partial, _is_batch_file)
     return folder
 
 
@@ -127,15 +114,15 @@ def _check_places(folder: Path, partial: Path) -> None:
     """Refuse folders that hold anything of others' before an hour of rendering, not after it."""
     for place in (folder, partial):
         if place.exists() or place.is_symlink():
-            check_ours(place, find_owner(place) if place == folder else _is_batch_file)
+            files.check_ours(place, find_owner(place) if place == folder else _is_batch_file)
 
 
 def _is_batch_file(path: Path) -> bool:
     """Whether a file of a folder of finished batches is ours: a batch, what is claimed, or a set being put together."""
     first, *rest = path.parts
     if rest:
-        return (first == "dataset" or ASIDE.fullmatch(first) is not None) and is_member("/".join(rest))
-    return any(pattern.fullmatch(first) for pattern in (BATCH, ASIDE))
+        return (first == "dataset" or files.ASIDE.fullmatch(first) is not None) and is_member("/".join(rest))
+    return any(pattern.fullmatch(first) for pattern in (BATCH, files.ASIDE))
 
 
 def _describe_finished(partial: Path, jobs: dict[str, dict]) -> str:
@@ -166,26 +153,21 @@ def plan_batches(config: RenderConfig) -> dict[str, dict]:
 
 def render_batch(job: dict) -> bytes:
     """Render one job in a child process and return its zip file; RenderError where the child fails."""
-    with scratch_folder(Path(tempfile.gettempdir()), "mmgsd-batch") as folder:
+    with files.scratch_folder(Path(tempfile.gettempdir()), "mmgsd-batch") as folder:
         out = folder / "batch.zip"
         (data,) = run_job(job | {"out": str(out)}, folder, f"rendering {job['split']} {job['episodes']}", [out])
         return data
 
 
-def run_job(
-    job: dict, folder: Path, doing: str, outs: Sequence[Path], *, module: str = "mmgsd.scene"
-) -> list[bytes]:  # fmt: skip
-    """What a child writes to ``outs`` (see `run_child`); RenderError, which says what it was ``doing``, where it fails.
-
-    It ends with this process.
-    """
-    code, stderr = run_child(job | {"parent": os.getpid()}, folder, module=module)
+def run_job(job: dict, folder: Path, doing: str, outs: Sequence[Path]) -> list[bytes]:
+    """What a child, which ends with this process, writes to ``outs``; RenderError says what it was ``doing``."""
+    code, stderr = run_child(job | {"parent": os.getpid()}, folder)
     if code or not all(out.is_file() for out in outs):
         raise RenderError(f"{doing} {_describe_exit(code)}:\n{stderr[-2000:]}")
     return [out.read_bytes() for out in outs]
 
 
-def run_child(job: dict, folder: Path, *, module: str = "mmgsd.scene") -> tuple[int, str]:
+def run_child(job: dict, folder: Path) -> tuple[int, str]:
     """Exit code and stderr of a child that does ``job``, with ``folder`` for all its temporary files."""
     place = str(Path(__file__).resolve().parents[2])
     path = os.pathsep.join(filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep)))  # an empty one is the cwd
@@ -194,9 +176,8 @@ def run_child(job: dict, folder: Path, *, module: str = "mmgsd.scene") -> tuple[
     env = {**one, **os.environ, "PYTHONSAFEPATH": "1", "PYTHONPATH": path, "TMPDIR": str(folder)}
     pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
     # a session of its own: Ctrl-C stops the parent, which ends its children, and none of them fails and is tried again
-    with subprocess.Popen(
-        [sys.executable, "-c", CHILD, module, place], env=env, text=True, start_new_session=True, **pipes
-    ) as child:
+    command = [sys.executable, "-c", CHILD, place]
+    with subprocess.Popen(command, env=env, text=True, start_new_session=True, **pipes) as child:
         _children.add(child)
         try:
             _, stderr = child.communicate(json.dumps(job))
@@ -217,10 +198,7 @@ def _describe_exit(code: int) -> str:
 
 @contextlib.contextmanager
 def connect(workers: int, scheduler: str) -> Iterator[Client]:
-    """A client of the Dask cluster at the address ``scheduler``, or of one in this process, with ``workers`` threads.
-
-    0 workers: as many as this process may use cores. At the end the children of this process are ended.
-    """
+    """A client of the Dask cluster at ``scheduler``, or of one here with ``workers`` threads (0: one a core)."""
     if scheduler:
         with open_client(scheduler) as client:
             yield client
@@ -240,9 +218,10 @@ def _render_missing(
     config: RenderConfig, jobs: dict, partial: Path, workers: int, scheduler: str, progress: bool
 ) -> None:
     """Render the jobs of which ``partial`` holds no whole batch; ValueError where it holds another configuration's."""
-    claimed = _is_claimed(config, partial)
-    missing = {name: job for name, job in jobs.items() if not _is_whole(partial / f"{name}.zip", job, claimed)}
-    write_json(partial / "config.json", _describe(config))
+    files.is_kept(partial / "config.json", functools.partial(_check_claim, config))
+    missing = {name: job for name, job in jobs.items()
+               if not files.is_kept(partial / f"{name}.zip", functools.partial(_check_batch, job))}  # fmt: skip
+    files.write_json(partial / "config.json", _describe(config))
     if missing:
         with connect(workers, scheduler) as client:
             _render_batches(client, missing, partial, config, progress)
@@ -253,44 +232,31 @@ def _render_batches(client: Client, jobs: dict, partial: Path, config: RenderCon
     bar = ProgressBar(total=total, desc=f"render {config.object}", unit="image", disable=not progress)
     with bar, run_tasks(client, render_batch, jobs, retries=2) as results:
         for name, data in results:
-            write_bytes(partial / f"{name}.zip", data)
+            files.write_bytes(partial / f"{name}.zip", data)
             bar.update(sum(n for _, n in jobs[name]["episodes"]))
 
 
-def _is_claimed(config: RenderConfig, partial: Path) -> bool:
-    """Whether the folder says that its batches are of this configuration; ValueError where it names another."""
-    path = partial / "config.json"
-    if not path.is_file():
-        return False
-    try:
-        stored = read_json(path)
-        if not isinstance(stored, dict):
-            raise DamagedFileError(f"{path} holds no configuration")
-    except DamagedFileError:
-        quarantine(path)
-        return False
-    _check_same_config(config, stored, partial)
+def _check_claim(config: RenderConfig, path: Path) -> bool:
+    """ValueError where the batches beside a file are of another configuration; DamagedFileError where it names none."""
+    stored = files.read_json(path)
+    if not isinstance(stored, dict):
+        raise files.DamagedFileError(f"{path} holds no configuration")
+    _check_same_config(config, stored, path.parent)
     return True
 
 
-def _is_whole(path: Path, job: dict, claimed: bool) -> bool:
-    """Whether a job's batch is there; one that is damaged, or of unknown origin, is set aside.
-
-    A batch carries its job's hash. One of before there were any is trusted where the folder names the configuration.
-    """
-    if not path.is_file():
-        return False
+def _check_batch(job: dict, path: Path) -> bool:
+    """DamagedFileError where a file is not the whole batch of a job, whose hash it carries."""
     try:
         with zipfile.ZipFile(path) as batch:
             labels, job_hash = json.loads(batch.read("labels.json")), batch.comment.decode()
             whole = batch.testzip() is None and all(label.keys() >= LABELS for label in labels)
-        whole = whole and len(labels) == sum(n for _, n in job["episodes"])
+        whole = whole and len(labels) == sum(n for _, n in job["episodes"]) and job_hash == job["mark"]
     except UNREADABLE:
         whole = False
-    whole = whole and (job_hash == job["mark"] or (claimed and not job_hash))
     if not whole:
-        quarantine(path)
-    return whole
+        raise files.DamagedFileError(f"{path} is no whole batch of this data set")
+    return True
 
 
 def _check_same_config(config: RenderConfig, stored: dict, folder: Path) -> None:
@@ -306,10 +272,7 @@ def _describe(config: RenderConfig) -> dict:
 
 
 def _name_scenes(config: RenderConfig) -> int | str:
-    """Version of the object's scenes; of an object of the user's own, with the digest of what its file describes.
-
-    Of another scene than the plain one, with its name and version.
-    """
+    """Version of an object's scenes and of what is around it; of an object of the user's own, its file's digest too."""
     planar, around = load_object(config), "" if config.scene == "plain" else f"-{config.scene}{WORKSPACES}"
     if planar is None:
         return f"{SCENES[config.object]}{around}" if around else SCENES[config.object]
@@ -333,28 +296,25 @@ def _describe_symmetry(config: RenderConfig) -> dict:
 def _assemble(config: RenderConfig, partial: Path, names: list[str]) -> Path:
     """Unpack the batches of these names into a folder of the data set's format, dataset.json last."""
     folder = partial / "dataset"
-    remove_folder(folder, lambda path: is_member(path.as_posix()))
+    files.remove_folder(folder, lambda path: is_member(path.as_posix()))
     for name in ("images", "masks"):
         (folder / name).mkdir(parents=True)
     rows = [row for name in names for row in _unpack(partial / f"{name}.zip", folder)]
     labels = pd.DataFrame(rows)
     table, digest = encode_table(labels)
+    versions = {name: importlib.metadata.version(name) for name in ("bpy", "numpy", "pillow")}
     (folder / "labels.parquet").write_bytes(table)
     info = {
         "format": FORMAT,
         "object": config.object,
         "images": labels.split.value_counts().to_dict(),
         "config": to_dict(config),
-        "versions": {"scenes": _name_scenes(config), **_list_versions()},
+        "versions": {"scenes": _name_scenes(config), **versions},
         **_describe_symmetry(config),
         "labels_sha256": digest,
     }
     (folder / "dataset.json").write_text(json.dumps(info))
     return folder
-
-
-def _list_versions() -> dict[str, str]:
-    return {name: importlib.metadata.version(name) for name in ("bpy", "numpy", "pillow")}
 
 
 def _unpack(path: Path, folder: Path) -> Iterator[dict]:

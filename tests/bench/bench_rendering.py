@@ -21,8 +21,8 @@ SPLIT = """
 import io, os, sys, time, zipfile
 os.environ.setdefault("MMGSD_THREADS", "1")
 from mmgsd.config import RenderConfig
-from mmgsd.scene.__main__ import write_view
-from mmgsd.scene.child import one_core, silenced
+from mmgsd.scene.__main__ import silenced, use_one_core
+from mmgsd.scene.batch import write_view
 clock = {}
 def timed(module, name, label):
     function = getattr(module, name)
@@ -35,8 +35,8 @@ def timed(module, name, label):
     setattr(module, name, wrapper)
 begin = time.perf_counter()
 with silenced():
-    with one_core():
-        from mmgsd.scene import blender, episode, randomize
+    use_one_core()
+    from mmgsd.scene import blender, episode, randomize
     clock["start of Blender (once a process)"] = time.perf_counter() - begin
     timed(episode, "build_object", "shape (physics or geometry)")
     timed(blender, "build_bvh", "labels: tree")

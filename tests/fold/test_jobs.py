@@ -7,8 +7,8 @@ import pytest
 from scipy.ndimage import distance_transform_edt
 
 from mmgsd.files import DamagedFileError
-from mmgsd.fold.jobs import act_job, demonstration_job, look_job, read_state, run_jobs, start_job, true_moves
-from mmgsd.fold.state import write_state
+from mmgsd.fold.jobs import act_job, demonstration_job, film_job, look_job, run_jobs, start_job, true_moves
+from mmgsd.fold.state import read_state, write_state
 from mmgsd.fold.tasks import TASKS
 
 bpy = pytest.importorskip("bpy")
@@ -109,19 +109,17 @@ def test_a_state_with_a_fault_stays_as_it_is(first, tmp_path):
     state = read_state(first["edge"])
     spoilt = dataclasses.replace(state, about=state.about | {"fault": "nowhere"})
     path = write_state(tmp_path / "spoilt.npz", spoilt)
-    after = manipulation.act(read_state(path), [((240, 240), (300, 300))], "mark")
+    after = manipulation.act(read_state(path), {"moves": [((240, 240), (300, 300))], "mark": "mark"})
     assert after.about["fault"] == "nowhere" and after.about["look"] == 1
     assert (after.vertices == state.vertices).all()
 
 
 def test_what_physics_spoils_is_said():
-    flat = cloth.flat_vertices()
-    assert manipulation.find_cloth_fault(flat) == ""
-    assert "stretched" in manipulation.find_cloth_fault(1.5 * flat)
-    assert manipulation.find_cloth_fault(flat * np.nan) == "nowhere"
     line = np.linspace((-0.8, 0, 0), (0.8, 0, 0), 625)
-    assert manipulation.find_rope_fault(line) == ""
-    assert "stretched" in manipulation.find_rope_fault(1.5 * line)
+    for name, rest in (("cloth", cloth.flat_vertices()), ("rope", line)):
+        assert manipulation.find_fault(rest, name) == ""
+        assert "stretched" in manipulation.find_fault(1.5 * rest, name)
+        assert manipulation.find_fault(rest * np.nan, name) == "nowhere"
 
 
 def test_a_gripper_takes_all_layers_near_the_rim_and_one_inside():
@@ -135,17 +133,20 @@ def test_a_gripper_takes_all_layers_near_the_rim_and_one_inside():
     assert manipulation.take_layers(folded, inside) == [inside]
 
 
-def test_jobs_refuse_what_no_task_has(first):
-    with pytest.raises(ValueError, match="start must be one of 'flat', 'wrinkled', 'corner', got 'straight'"):
-        start_job(TASKS["edge"], "straight", "plain", 0)
-    with pytest.raises(ValueError, match="ground must be one of 'plain', 'workspace', got 'sea'"):
-        start_job(TASKS["edge"], "flat", "sea", 0)
-    with pytest.raises(ValueError, match="task must be one of .*, got 'iron'"):
-        start_job(dataclasses.replace(TASKS["edge"], name="iron"), "flat", "plain", 0)
-    with pytest.raises(ValueError, match="moves must be pairs of finite pixels"):
-        act_job(first["edge"], [((0.0, np.nan), (1.0, 1.0))])
-    with pytest.raises(ValueError, match="again must be at least 1"):
-        look_job(first["edge"], 0)
+REFUSED = {
+    "start .*got 'straight'": lambda state: start_job(TASKS["edge"], "straight", "plain", 0),
+    "ground .*got 'sea'": lambda state: start_job(TASKS["edge"], "flat", "sea", 0),
+    "task .*got 'iron'": lambda state: start_job(dataclasses.replace(TASKS["edge"], name="iron"), "flat", "plain", 0),
+    "moves": lambda state: act_job(state, [((0.0, np.nan), (1.0, 1.0))]),
+    "again": lambda state: look_job(state, 0),
+    "motion": lambda state: film_job(state, NOWHERE, "dance", frames=2),
+}
+
+
+@pytest.mark.parametrize("message", REFUSED)
+def test_jobs_refuse_what_no_task_has(first, message):
+    with pytest.raises(ValueError, match=message):
+        REFUSED[message](first["edge"])
 
 
 def test_an_act_is_marked_by_the_state_that_it_goes_on_from(first):

@@ -165,7 +165,7 @@ def test_turn_stays_within_the_limit(limit):
 
 
 def test_a_ray_that_meets_nothing_leaves_its_point_visible():
-    deformed = blender.DeformedObject(None, np.array([[0.0, 0, 0]]), 0.01, {})
+    deformed = blender.DeformedObject(None, np.array([[0.0, 0, 0]]), {}, lambda hits, _: np.zeros(len(hits), bool))
     bvh = blender.BVHTree.FromPolygons([], [])
     camera, _ = randomize.draw_camera(np.random.default_rng(0), deformed.points, SIZE, 45.0)
     assert blender.find_visible(deformed, bvh, camera).tolist() == [True]
@@ -173,15 +173,16 @@ def test_a_ray_that_meets_nothing_leaves_its_point_visible():
 
 def test_crossings_count_a_flap_pushed_through_the_cloth():
     vertices = cloth.flat_vertices()
-    assert cloth.count_crossings(vertices, cloth.grid_faces(cloth.SIDE)) == 0
+    faces = cloth.square_cloth().faces
+    assert cloth.count_crossings(vertices, faces) == 0
     grid = vertices.reshape(cloth.SIDE, cloth.SIDE, 3)
     grid[0, 0] = grid[10, 10] + (0.3 * cloth.SPACING, 0.3 * cloth.SPACING, -0.05)  # its neighbours stay above
     grid[0, 1, 2] = grid[1, 0, 2] = grid[1, 1, 2] = 0.05
-    assert cloth.count_crossings(vertices, cloth.grid_faces(cloth.SIDE)) > 0
+    assert cloth.count_crossings(vertices, faces) > 0
 
 
 def test_a_cloth_that_never_comes_to_lie_is_given_up_with_the_reasons(monkeypatch):
-    results = iter([cloth.flat_vertices() * factor for factor in ((1, 1, np.nan), (2, 2, 1))] * 99)
+    results = iter([cloth.flat_vertices()[None] * factor for factor in ((1, 1, np.nan), (2, 2, 1))] * 99)
     monkeypatch.setattr(cloth, "simulate", lambda *_: next(results))
     monkeypatch.setattr(cloth, "STARTS", 2)
     with pytest.raises(SceneError, match="cloth did not .*'flat' in 2 starts with 3 .*nowhere 3 times, stretched.* 3"):
@@ -208,29 +209,33 @@ def test_unknown_split_and_state_are_named():
 
 
 def run_job(tmp_path, name, threads, **changes):
-    job = {"config": {"samples": 1}, "split": "test", "episodes": [[1, 2]], "out": str(tmp_path / name), **changes}
+    job = {"split": "test", "episodes": [[1, 2]], "out": str(tmp_path / name), "config": {"samples": 1, **changes}}
     environment = {**os.environ, "MMGSD_THREADS": str(threads)}
     command = [sys.executable, "-m", "mmgsd.scene"]
     return subprocess.run(command, input=json.dumps(job), text=True, capture_output=True, env=environment)
 
 
-def test_jobs_archive_holds_every_view_and_does_not_depend_on_the_threads(tmp_path):
+@pytest.mark.parametrize(("config", "size", "told"), [
+    ({}, (485, 485), {"turn_deg", "background"}),
+    ({"object": "rope", "scene": "workspace"}, (480, 640), {"present", "things", "light", "tilt_deg"}),
+])  # fmt: skip
+def test_jobs_archive_holds_every_view_and_does_not_depend_on_the_threads(tmp_path, config, size, told):
     for name, threads in (("a.zip", 1), ("b.zip", 2)):
-        done = run_job(tmp_path, name, threads)
+        done = run_job(tmp_path, name, threads, **config)
         assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
     assert (tmp_path / "a.zip").read_bytes() == (tmp_path / "b.zip").read_bytes()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.zip", "b.zip"]
     with zipfile.ZipFile(tmp_path / "a.zip") as archive:
         labels = json.loads(archive.read("labels.json"))
         assert [(row["episode"], row["view"], row["split"]) for row in labels] == [(1, 0, "test"), (1, 1, "test")]
-        assert np.shape(labels[0]["xy"]) == (625, 2)
+        assert np.shape(labels[0]["xy"]) == (625, 2) and told <= set(labels[0]["info"])
         with archive.open("000001_01.webp") as image, archive.open("000001_01_mask.png") as mask:
-            assert np.asarray(Image.open(image)).shape == (485, 485, 3)
+            assert np.asarray(Image.open(image)).shape == (*size, 3)
             assert np.asarray(Image.open(mask)).dtype == bool
 
 
 def test_a_failed_job_says_why_and_leaves_nothing(tmp_path):
-    done = run_job(tmp_path, "a.zip", 1, config={"sampels": 1})
+    done = run_job(tmp_path, "a.zip", 1, sampels=1)
     assert done.returncode == 1
     assert "did you mean 'samples'" in done.stderr
     assert list(tmp_path.iterdir()) == []
@@ -241,9 +246,9 @@ def test_a_sheets_points_are_its_vertices(name):
     planar = load_planar_object(find_root() / "data" / "objects" / f"{name}.json")
     blender.reset_scene()
     vertices, _ = cloth.deform(np.random.default_rng(4), "flat", planar)
-    mesh = cloth._add_rendered(vertices, planar)
-    points = blender.read_vertices(mesh.data)[: len(vertices)]
-    assert len(mesh.data.vertices) > 3 * len(vertices)
+    deformed = cloth.add_cloth(vertices, {}, planar)
+    assert len(deformed.mesh.data.vertices) > 3 * len(vertices) == 3 * len(deformed.points)
+    points = deformed.points
     inner = np.linalg.norm(points - vertices - [0, 0, np.mean(points[:, 2] - vertices[:, 2])], axis=1)
     assert np.median(inner) < 0.005  # subdivision smooths, it does not move points along the sheet
     assert inner.max() < 0.02

@@ -6,24 +6,23 @@ import dataclasses
 import functools
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import bpy
 import numpy as np
 from mathutils.bvhtree import BVHTree
 
 from mmgsd.config import RenderConfig
-from mmgsd.scene import SceneError
-from mmgsd.scene.blender import DeformedObject, add_attribute, add_floor, add_mesh, add_object, read_vertices
-from mmgsd.scene.objects.meshes import SPACING
+from mmgsd.scene import SceneError, blender
+from mmgsd.scene.blender import DeformedObject, add_mesh, read_vertices
+from mmgsd.scene.geometry import choose, grid_faces
+from mmgsd.scene.objects.meshes import SPACING, count_edges
 from mmgsd.scene.objects.planar_object import PlanarObject
-from mmgsd.scene.sampling import choose
 from mmgsd.symmetry import grid_group
 
 SIDE = 37  # simulated vertices a side; with 49 a frame takes nearly twice as long
 RENDERED_SIDE = 2 * SIDE - 1  # once subdivided: every third vertex is a material point
 EXTENT = 1.0  # m
-VISIBILITY_RADIUS = 0.004  # m; less than the distance that self-collision keeps between two layers
+OWN_RADIUS = 0.004  # m; less than the distance that self-collision keeps between two layers
 STATES = {"flat": 0.10, "wrinkled": 0.24, "folded": 0.26, "folded twice": 0.10, "corner": 0.20, "crumpled": 0.10}
 # in a workspace: lying about as on a table, and folded as grippers fold
 WORKSPACE_STATES = {
@@ -39,45 +38,35 @@ MAX_HEIGHT = 0.17  # m
 MAX_CROSSINGS = 9  # pairs of quads, of 1296, that cut each other: more are seen as spots of the other layer
 
 
-@dataclass(frozen=True)
-class Grasp:
-    """A vertex and the way it is moved, one displacement (m) from its start for each frame; zeros pin it."""
-
-    vertex: int
-    path: np.ndarray  # (F, 3)
+Grasps = dict[int, np.ndarray]  # displacements (F, 3) m of vertices from their start, one a frame; zeros pin one
+Plan = Callable[[np.random.Generator, np.ndarray], tuple[Grasps, int]]
 
 
-def build_cloth(rng: np.random.Generator, config: RenderConfig) -> DeformedObject:
-    """Deform a cloth into a random state and add it, smoothly subdivided, to the current scene.
-
-    The 625 points are (25, 25) row-major vertices of the rendered surface itself; 1 m a side.
-    """
-    workspace = config.scene == "workspace"
-    planar, states = (
-        draw_rectangle(rng) if workspace else square_cloth(),
-        WORKSPACE_STATES if workspace else STATES,
-    )
+def build_cloth(rng: np.random.Generator, config: RenderConfig, planar: PlanarObject | None = None) -> DeformedObject:
+    """Deform a cloth, or a ``planar`` sheet, into a random state and add it to the current scene (see `add_cloth`)."""
+    states = STATES
+    if planar is None and config.scene == "workspace":
+        planar, states = draw_rectangle(rng), WORKSPACE_STATES
     state = choose(rng, states)
     vertices, frames = deform(rng, state, planar)
     return add_cloth(vertices, {"state": state, "physics_frames": frames}, planar)
 
 
-def build_planar_object(rng: np.random.Generator, planar: PlanarObject) -> DeformedObject:
-    """The same with a sheet of another shape, each of whose vertices is a material point."""
-    state = choose(rng, STATES)
-    vertices, frames = deform(rng, state, planar)
-    mesh = _add_rendered(vertices, planar)
-    points = read_vertices(mesh.data)[: len(vertices)]  # subdivision appends the new ones
-    return DeformedObject(mesh, points, VISIBILITY_RADIUS, {"state": state, "physics_frames": frames})
-
-
 def add_cloth(
     vertices: np.ndarray, info: dict[str, str | float | int], planar: PlanarObject | None = None
 ) -> DeformedObject:
-    """Add simulated vertices (1369, 3) m of the square or a rectangle to the scene as a smooth cloth on the floor."""
-    mesh = _add_rendered(vertices, planar or square_cloth())
-    grid = read_vertices(mesh.data)[_order_row_major(mesh.data)]  # (73, 73, 3)
-    return DeformedObject(mesh, grid[::3, ::3].reshape(-1, 3), VISIBILITY_RADIUS, info)
+    """Add simulated vertices (V, 3) m of a sheet (None: the square) to the scene, smoothly subdivided, on the floor.
+
+    The 625 points of a square or a rectangle are (25, 25) row-major vertices of the rendered surface itself; of another
+    sheet, each of its vertices is a material point.
+    """
+    planar = planar or square_cloth()
+    mesh = _add_rendered(vertices, planar)
+    chosen = slice(len(vertices))  # subdivision appends the new ones
+    if planar.name == "cloth":
+        chosen = _order_row_major(mesh.data)[::3, ::3].ravel()
+    points = read_vertices(mesh.data)[chosen]
+    return DeformedObject(mesh, points, info, lambda hits, i: np.linalg.norm(hits - points[i], axis=1) < OWN_RADIUS)
 
 
 def deform(rng: np.random.Generator, state: str, planar: PlanarObject | None = None) -> tuple[np.ndarray, int]:
@@ -103,22 +92,15 @@ def deform(rng: np.random.Generator, state: str, planar: PlanarObject | None = N
 
 
 def _perform(
-    rng: np.random.Generator,
-    planar: PlanarObject,
-    start: np.ndarray,
-    move: tuple[Plan, ...],
-    faults: Counter[str],
+    rng: np.random.Generator, planar: PlanarObject, start: np.ndarray, move: tuple[Plan, ...], faults: Counter[str]
 ) -> tuple[np.ndarray | None, int]:
-    """The vertices after a move, None where it failed too often, and the frames of physics that all attempts took.
-
-    ``faults`` counts why attempts failed.
-    """
+    """The vertices after a move, None where it failed too often, and all attempts' frames; ``faults`` counts why."""
     frames = 0
     for _ in range(ATTEMPTS):
         vertices = start.copy()
         for plan in move:
             grasps, count = plan(rng, vertices)
-            vertices = simulate(planar, vertices, grasps, count)
+            vertices = simulate(planar, vertices, grasps, count)[-1]
             frames += count
         if not (fault := _find_fault(planar, vertices)):
             return vertices, frames
@@ -141,8 +123,7 @@ def _find_fault(planar: PlanarObject, vertices: np.ndarray) -> str:
 
 def measure_stretch(planar: PlanarObject, vertices: np.ndarray) -> float:
     """How much longer than at rest the edges of a cloth (V, 3) m are: the 99th percentile of their shares."""
-    sides = np.sort(np.stack([planar.faces, np.roll(planar.faces, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
-    a, b = np.unique(sides, axis=0).T
+    a, b = count_edges(planar.faces)[0].T
     now, at_rest = (np.linalg.norm(points[a] - points[b], axis=-1) for points in (vertices, planar.rest))
     return float(np.quantile(now / at_rest, 0.99))
 
@@ -165,14 +146,12 @@ def flat_vertices() -> np.ndarray:
 @functools.cache
 def square_cloth() -> PlanarObject:
     """The simulated square cloth."""
-    return PlanarObject("cloth", flat_vertices(), grid_faces(SIDE), grid_group("c4", side=SIDE))
+    faces = grid_faces(SIDE, SIDE)[:, ::-1]  # normals up
+    return PlanarObject("cloth", flat_vertices(), faces, grid_group("c4", side=SIDE))
 
 
 def draw_rectangle(rng: np.random.Generator) -> PlanarObject:
-    """The square cloth, or one that is a little or up to 1.5 times longer than wide.
-
-    Its points are those of the square, and its corners are as alike as a square's.
-    """
+    """The square cloth, or one up to 1.5 times longer than wide, whose points and symmetry are those of the square."""
     square = square_cloth()
     width = rng.choice([1.0, rng.uniform(0.93, 1.0), rng.uniform(1 / 1.5, 0.93)], p=[0.5, 0.15, 0.35])
     return dataclasses.replace(square, rest=square.rest * (width, 1.0, 1.0))
@@ -192,80 +171,80 @@ def _rippled(rng: np.random.Generator, planar: PlanarObject, height: float) -> n
 
 # Plans: (rng, vertices) -> (grasps, frames) of one simulation; they may move the vertices first. --------------------
 
-Plan = Callable[[np.random.Generator, np.ndarray], tuple[list[Grasp], int]]
 
-
-def _settle(rng: np.random.Generator, vertices: np.ndarray) -> tuple[list[Grasp], int]:
+def _settle(rng: np.random.Generator, vertices: np.ndarray) -> tuple[Grasps, int]:
     """Let go."""
-    return [], SETTLE_FRAMES
+    return {}, SETTLE_FRAMES
 
 
-def _drop(rng: np.random.Generator, vertices: np.ndarray) -> tuple[list[Grasp], int]:
+def _drop(rng: np.random.Generator, vertices: np.ndarray) -> tuple[Grasps, int]:
     """Raise and tilt the cloth in place, pin it at up to two random points in the air, let the rest fall."""
     tilt = rng.uniform(-0.25, 0.25, size=2)
     vertices[:, 2] += vertices[:, :2] @ tilt
     vertices[:, 2] += rng.uniform(0.02, 0.08) - vertices[:, 2].min()
     picked = rng.choice(len(vertices), size=rng.integers(0, 3), replace=False)
     frames = 16
-    return [Grasp(int(i), np.zeros((frames, 3))) for i in picked], frames
+    return {int(i): np.zeros((frames, 3)) for i in picked}, frames
 
 
-def _drag(rng: np.random.Generator, vertices: np.ndarray) -> tuple[list[Grasp], int]:
+def _drag(rng: np.random.Generator, vertices: np.ndarray) -> tuple[Grasps, int]:
     """Push two to four random points across the floor, roughly inwards, so that wrinkles form between them."""
     frames = 14
     picked = rng.choice(len(vertices), size=rng.integers(2, 5), replace=False)
     progress = np.linspace(0, 1, frames)[:, None]
     inward = -vertices[picked, :2] * rng.uniform(0.15, 0.45, size=(len(picked), 1))
     target = inward + rng.normal(scale=0.04, size=(len(picked), 2))
-    return [Grasp(int(i), progress * np.append(t, 0.01)) for i, t in zip(picked, target, strict=True)], frames
+    return {int(i): progress * np.append(t, 0.01) for i, t in zip(picked, target, strict=True)}, frames
 
 
-def _gather(rng: np.random.Generator, vertices: np.ndarray) -> tuple[list[Grasp], int]:
+def _gather(rng: np.random.Generator, vertices: np.ndarray) -> tuple[Grasps, int]:
     """Lift random points and bring them together: a crumpled heap."""
     frames = 26
     picked = rng.choice(len(vertices), size=rng.integers(4, 8), replace=False)
     centre = rng.uniform(-0.1, 0.1, size=2)
-    grasps = []
+    grasps = {}
     for i in picked:
         offset = (centre - vertices[i, :2]) * rng.uniform(0.4, 0.75)
         shift = np.append(offset, rng.uniform(0.0, 0.06))
-        grasps.append(Grasp(int(i), arc_path(shift, rng.uniform(0.05, 0.3), frames)))
+        grasps[int(i)] = arc_path(shift, rng.uniform(0.05, 0.3), frames)
     return grasps, frames
 
 
-def _fold(rng: np.random.Generator, vertices: np.ndarray) -> tuple[list[Grasp], int]:
+def _fold(rng: np.random.Generator, vertices: np.ndarray) -> tuple[Grasps, int]:
     """Fold along a line parallel to an edge or oblique, grasping the far rim where it is furthest."""
     angle = rng.integers(4) * np.pi / 2 + rng.choice([0.0, np.pi / 4, rng.uniform(0, np.pi / 2)])
     return _fold_over(rng, vertices, angle, rng.uniform(0.35, 0.7))
 
 
-def _fold_corner(rng: np.random.Generator, vertices: np.ndarray) -> tuple[list[Grasp], int]:
+def _fold_corner(rng: np.random.Generator, vertices: np.ndarray) -> tuple[Grasps, int]:
     """Fold one corner over, so that some of the under-side shows."""
     angle = rng.integers(4) * np.pi / 2 + np.pi / 4 + rng.uniform(-0.35, 0.35)
     return _fold_over(rng, vertices, angle, rng.uniform(0.2, 0.4))
 
 
-def _fold_over(rng: np.random.Generator, vertices: np.ndarray, angle: float, share: float) -> tuple[list[Grasp], int]:
+def _fold_over(rng: np.random.Generator, vertices: np.ndarray, angle: float, share: float) -> tuple[Grasps, int]:
     """Move the vertices furthest in direction ``angle`` (rad) over the line that cuts off ``share`` of the cloth."""
-    normal = np.array([np.cos(angle), np.sin(angle)])
+    normal, across = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
     along = vertices[:, :2] @ normal
     line = along.max() - share * np.ptp(along)
-    tangent = vertices[:, :2] @ np.array([-normal[1], normal[0]])
+    tangent = vertices[:, :2] @ across
     rim = np.flatnonzero(along > along.max() - 1.5 * SPACING)
     held = {int(rim[np.argmin(tangent[rim])]), int(rim[np.argmax(tangent[rim])]), int(rim[len(rim) // 2])}
     frames = int(15 + 20 * (along.max() - line))
     reach, skew = rng.uniform(0.85, 1.0), rng.normal(scale=0.05)
-    grasps = []
+    grasps = {}
     for i in sorted(held):
-        shift = -2 * reach * (along[i] - line) * (normal + skew * np.array([-normal[1], normal[0]]))
-        grasps.append(Grasp(i, arc_path(np.append(shift, 0.03), 0.75 * (along[i] - line), frames)))
-    anchors = np.flatnonzero(along < line - 4 * SPACING)
-    for i in rng.choice(anchors, size=min(4, len(anchors)), replace=False):
-        grasps.append(Grasp(int(i), np.zeros((frames, 3))))
-    return grasps, frames
+        shift = -2 * reach * (along[i] - line) * (normal + skew * across)
+        grasps[i] = arc_path(np.append(shift, 0.03), 0.75 * (along[i] - line), frames)
+    return grasps | _pin(rng, np.flatnonzero(along < line - 4 * SPACING), frames), frames
 
 
-def _fold_grasped(rng: np.random.Generator, vertices: np.ndarray) -> tuple[list[Grasp], int]:
+def _pin(rng: np.random.Generator, vertices: np.ndarray, frames: int) -> Grasps:
+    """Hold four of the vertices (N,), or all where they are fewer, in their places."""
+    return {int(i): np.zeros((frames, 3)) for i in rng.choice(vertices, size=min(4, len(vertices)), replace=False)}
+
+
+def _fold_grasped(rng: np.random.Generator, vertices: np.ndarray) -> tuple[Grasps, int]:
     """Carry one corner of a cloth (1369, 3) m or two neighbours towards the opposite, as one gripper or two do."""
     corners = np.array([0, SIDE - 1, SIDE**2 - 1, SIDE * (SIDE - 1)])  # around the cloth
     first, hands = int(rng.integers(4)), int(rng.integers(1, 3))
@@ -279,9 +258,7 @@ def _fold_grasped(rng: np.random.Generator, vertices: np.ndarray) -> tuple[list[
               for i, shift, far in zip(held, shifts, length, strict=True)}  # fmt: skip
     along = (vertices[:, :2] - vertices[held[0], :2]) @ shifts.mean(axis=0) / max(length.max(), 1e-6)
     anchors = np.setdiff1d(np.flatnonzero(along > 0.55 * length.max()), held)
-    for i in rng.choice(anchors, size=min(4, len(anchors)), replace=False):
-        grasps[int(i)] = np.zeros((frames, 3))
-    return [Grasp(i, path) for i, path in grasps.items()], frames
+    return grasps | _pin(rng, anchors, frames), frames
 
 
 def arc_path(shift: np.ndarray, height: float, frames: int) -> np.ndarray:
@@ -311,49 +288,43 @@ MOVES: dict[str, tuple[tuple[Plan, ...], ...]] = {
 
 
 def simulate(
-    planar: PlanarObject, vertices: np.ndarray, grasps: list[Grasp], frames: int, *, friction: float = FRICTION,
-    watched: list[np.ndarray] | None = None,
-) -> np.ndarray:  # fmt: skip
-    """Run ``frames`` frames of cloth physics from ``vertices`` (V, 3) m at rest; the cloth remembers its flat shape.
+    planar: PlanarObject, vertices: np.ndarray, grasps: Grasps, frames: int, *, friction: float = FRICTION
+) -> np.ndarray:
+    """Vertices (frames, V, 3) m under cloth physics, from ``vertices`` (V, 3) m at rest on; some may not be finite.
 
-    Grasped vertices follow their paths, which must be ``frames`` long; ``friction`` (0 to 80) is that of the floor.
-    Physics may return vertices that are not finite. Those of each frame are added to ``watched``, where that is given.
+    The cloth remembers its flat shape. Grasped vertices follow their paths, which must be ``frames`` long; ``friction``
+    (0 to 80) is that of the floor.
     """
     scene = bpy.context.scene
     scene.frame_start, scene.frame_end = 1, frames
     scene.frame_set(1)
     cloth = add_mesh("cloth physics", planar.rest, planar.faces)
     floor = _add_physics_floor(friction)
-    _set_start(cloth, vertices)
-    hooks = [_add_hook(cloth, grasp) for grasp in grasps]
-    _add_physics(cloth, [grasp.vertex for grasp in grasps], frames)
-    for frame in range(1, frames + 1):
-        scene.frame_set(frame)
-        if watched is not None or frame == frames:
-            result = read_vertices(cloth.evaluated_get(bpy.context.evaluated_depsgraph_get()).data)
-        if watched is not None:
-            watched.append(result)
-    for thing in (cloth, floor, *hooks):
-        bpy.data.objects.remove(thing)
-    return result
-
-
-def _set_start(cloth: bpy.types.Object, vertices: np.ndarray) -> None:
     cloth.shape_key_add(name="rest")
     start = cloth.shape_key_add(name="start")
     start.data.foreach_set("co", vertices.astype(np.float32).ravel())
     start.value = 1.0
+    hooks = [_add_hook(cloth, vertex, path) for vertex, path in grasps.items()]
+    _add_physics(cloth, list(grasps), frames)
+    passed = []
+    for frame in range(1, frames + 1):
+        scene.frame_set(frame)
+        passed.append(read_vertices(cloth.evaluated_get(bpy.context.evaluated_depsgraph_get()).data))
+    for thing in (cloth, floor, *hooks):
+        bpy.data.objects.remove(thing)
+    return np.stack(passed)
 
 
-def _add_hook(cloth: bpy.types.Object, grasp: Grasp) -> bpy.types.Object:
-    hook = add_object("hook", None)
-    for frame, shift in enumerate(grasp.path, start=1):
+def _add_hook(cloth: bpy.types.Object, vertex: int, path: np.ndarray) -> bpy.types.Object:
+    """What moves a vertex along a path (F, 3) m."""
+    hook = blender.add_object("hook", None)
+    for frame, shift in enumerate(path, start=1):
         hook.location = shift
         hook.keyframe_insert("location", frame=frame)
     modifier = cloth.modifiers.new("hook", "HOOK")
     modifier.object = hook
     modifier.falloff_type = "NONE"
-    modifier.vertex_indices_set([grasp.vertex])
+    modifier.vertex_indices_set([vertex])
     return hook
 
 
@@ -374,7 +345,7 @@ def _add_physics(cloth: bpy.types.Object, pinned: list[int], frames: int) -> Non
 
 
 def _add_physics_floor(friction: float) -> bpy.types.Object:
-    floor = add_floor("physics floor", 3.0)
+    floor = blender.add_floor("physics floor", 3.0)
     floor.modifiers.new("collision", "COLLISION")
     floor.collision.cloth_friction = friction
     floor.collision.thickness_outer = 0.005
@@ -384,20 +355,14 @@ def _add_physics_floor(friction: float) -> bpy.types.Object:
 # The rendered surface. ----------------------------------------------------------------------------------------------
 
 
-def grid_faces(side: int) -> np.ndarray:
-    """Quads ((side - 1)², 4) of a row-major grid, their normals up where the grid is flat as in `flat_vertices`."""
-    index = np.arange(side * side).reshape(side, side)
-    quads = [index[1:, :-1], index[1:, 1:], index[:-1, 1:], index[:-1, :-1]]
-    return np.stack(quads, axis=-1).reshape(-1, 4)
-
-
 def _add_rendered(vertices: np.ndarray, planar: PlanarObject) -> bpy.types.Object:
     """A smooth static mesh lying on z = 0: of the square cloth's, 73 × 73 vertices."""
     coarse = add_mesh("cloth coarse", vertices, planar.faces)
     if planar.name == "cloth":  # textures in its own coordinates; they have a square's symmetry
-        add_attribute(coarse.data, "rest", flat_vertices() / EXTENT)
+        blender.add_attribute(coarse.data, "rest", flat_vertices() / EXTENT)
     low, size = planar.rest.min(axis=0), np.ptp(planar.rest, axis=0)
-    add_attribute(coarse.data, "face", (planar.rest - low) / np.maximum(size, 1e-9))  # for images: 0 to 1 over it
+    over = (planar.rest - low) / np.maximum(size, 1e-9)
+    blender.add_attribute(coarse.data, "face", over)  # for images: 0 to 1 over it
     subdivision = coarse.modifiers.new("subdivision", "SUBSURF")
     subdivision.levels = 1
     mesh = bpy.data.meshes.new_from_object(coarse.evaluated_get(bpy.context.evaluated_depsgraph_get()))
@@ -407,14 +372,13 @@ def _add_rendered(vertices: np.ndarray, planar: PlanarObject) -> bpy.types.Objec
     mesh.vertices.foreach_set("co", dense.astype(np.float32).ravel())
     mesh.shade_smooth()
     mesh.materials.append(None)
-    return add_object("cloth", mesh)
+    return blender.add_object("cloth", mesh)
 
 
 def _order_row_major(mesh: bpy.types.Mesh) -> np.ndarray:
     """Indices (73, 73) of a subdivided cloth's vertices by their place at rest; Blender appends the new ones."""
-    rest = np.empty(3 * len(mesh.vertices), dtype=np.float32)
-    mesh.attributes["rest"].data.foreach_get("vector", rest)
-    column, row = np.rint((rest.reshape(-1, 3)[:, :2] * (1, -1) + 0.5) * (RENDERED_SIDE - 1)).astype(int).T
+    rest = blender.read_attribute(mesh, "rest")[:, :2]
+    column, row = np.rint((rest * (1, -1) + 0.5) * (RENDERED_SIDE - 1)).astype(int).T
     order = np.empty((RENDERED_SIDE, RENDERED_SIDE), dtype=int)
-    order[row, column] = np.arange(len(rest) // 3)
+    order[row, column] = np.arange(len(rest))
     return order

@@ -47,7 +47,11 @@ def read_outline(outline: Any) -> np.ndarray:
     selected = _drop_straight(scaled, _drop_repeated(scaled))
     if len(selected) < 3:
         raise ValueError("outline must enclose an area, got corners on one line")
-    _refuse_crossing(scaled[selected], corners[selected])
+    if (meeting := _find_crossing(scaled[selected])) is not None:
+        after = np.roll(corners[selected], -1, axis=0)
+        written = [f"[{x:g}, {y:g}]" for k in meeting for x, y in (corners[selected][k], after[k])]
+        raise ValueError("outline must not cross or touch itself: its edge from {} to {} meets the one from {} to {}"
+                         .format(*written))  # fmt: skip
     x, y = scaled[selected].T
     area = 0.5 * np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)
     if abs(area) < MIN_AREA:
@@ -100,14 +104,6 @@ def _drop_straight(points: np.ndarray, ring: list[int]) -> list[int]:
         if aside or (step.conjugate() * (after - place[i])).real <= 0:
             selected.append(i)
     return selected
-
-
-def _refuse_crossing(points: np.ndarray, corners: np.ndarray) -> None:
-    """ValueError, in the corners (N, 2) as they were written, where two edges of a ring (N, 2) meet."""
-    if (meeting := _find_crossing(points)) is not None:
-        written = [f"[{x:g}, {y:g}]" for k in meeting for x, y in (corners[k], corners[(k + 1) % len(corners)])]
-        raise ValueError("outline must not cross or touch itself: its edge from {} to {} meets the one from {} to {}"
-                         .format(*written))  # fmt: skip
 
 
 def _find_crossing(points: np.ndarray) -> tuple[int, int] | None:
@@ -172,13 +168,10 @@ def _choose_orbits(candidates: np.ndarray, transforms: list[np.ndarray]) -> np.n
         first = np.array([not (distance[i, :i] < 1e-6).any() for i in range(len(moved))])  # a fixed point counts once
         orbit = moved[first]
         gaps = distance[np.ix_(first, first)] + np.eye(len(orbit))
-        if gaps.min() > 0.55 * SPACING and (not len(chosen) or _gap(chosen, orbit) > 0.55 * SPACING):
+        others = np.linalg.norm(chosen[:, None] - orbit[None], axis=-1)
+        if min(gaps.min(), others.min(initial=np.inf)) > 0.55 * SPACING:
             chosen = np.concatenate([chosen, orbit])
     return chosen
-
-
-def _gap(chosen: np.ndarray, orbit: np.ndarray) -> float:
-    return float(np.linalg.norm(chosen[:, None] - orbit[None], axis=-1).min())
 
 
 # Mesh files. --------------------------------------------------------------------------------------------------------
@@ -299,7 +292,7 @@ def _check_one_layer(rest: np.ndarray, faces: np.ndarray) -> None:
     if (area > 0).any() and (area < 0).any():
         raise ValueError(f"must have one layer whose faces look one way, got {np.sum(area > 0)} triangles that look "
                          f"up and {np.sum(area < 0)} down: remove a layer, or recalculate the normals")  # fmt: skip
-    edges, times = _count_edges(faces)
+    edges, times = count_edges(faces)
     if times.max() > 2:
         a, b = edges[np.argmax(times)] + 1
         raise ValueError(f"has an edge, from vertex {a} to {b}, that {times.max()} faces share: a sheet's edge has two")
@@ -308,13 +301,7 @@ def _check_one_layer(rest: np.ndarray, faces: np.ndarray) -> None:
         raise ValueError(f"must be in one piece, got {parts}: merge vertices in the same place, or give one piece")
 
 
-def _count_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def count_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The edges (E, 2) of faces, lower index first, and how many faces (E,) each has."""
     sides = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
     return np.unique(sides, axis=0, return_counts=True)
-
-
-def find_border(faces: np.ndarray) -> np.ndarray:
-    """The edges (E, 2) of a mesh that one face alone has: its rim, and that of holes."""
-    edges, times = _count_edges(faces)
-    return edges[times == 1]

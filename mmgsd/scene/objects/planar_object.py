@@ -21,7 +21,6 @@ from __future__ import annotations
 import difflib
 import reprlib
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
@@ -31,7 +30,7 @@ from scipy.spatial import cKDTree
 from mmgsd.config import OBJECTS
 from mmgsd.files import read_json
 from mmgsd.scene.geometry import spin
-from mmgsd.scene.objects.meshes import SPACING, UP, find_border, is_number, read_obj, read_outline, refine, triangulate
+from mmgsd.scene.objects.meshes import SPACING, UP, count_edges, is_number, read_obj, read_outline, refine, triangulate
 from mmgsd.symmetry import SymmetryGroup
 
 TOLERANCE = 0.01  # m by which a symmetric shape may miss itself
@@ -94,7 +93,8 @@ def _build(path: Path, values: Any) -> PlanarObject:
         rest, faces, border, transforms = _mesh_outline(read_outline(values["outline"]), symmetry)
     else:
         rest, faces = read_obj(_find_mesh(path, values["mesh"]), up=values.get("up", "z"))
-        border = Border(*(rest[ends] for ends in find_border(faces).T)).centred()
+        edges, times = count_edges(faces)
+        border = Border(*rest[edges[times == 1].T]).centred()  # the rim, and that of holes
         transforms = [np.eye(3)] if permutations is not None else _list_transforms(symmetry, border)
         _check_vertices(rest, transforms)
     if permutations is None:
@@ -134,7 +134,7 @@ def _find_mesh(path: Path, name: Any) -> Path:
 
 def _mesh_outline(corners: np.ndarray, symmetry: Any) -> tuple[np.ndarray, np.ndarray, Border, list[np.ndarray]]:
     """Vertices, triangles and border of the outline (N, 3), all about its centre, and its symmetry."""
-    border = Border.around(corners)
+    border = Border(corners, np.roll(corners, -1, axis=0))
     transforms = _list_transforms(symmetry, border.centred())
     centre = refine(corners).mean(0)
     if any(np.linalg.norm(t @ (centre - border.centre) - (centre - border.centre)) > 1e-9 for t in transforms):
@@ -157,20 +157,8 @@ class Border:
         self.points = starts[edge] + place[:, None] * step  # (P, 3) where pieces start
         self.steps = step
         self.middles = self.points + step / 2
-
-    @classmethod
-    def around(cls, corners: np.ndarray) -> Border:
-        """Of a polygon (N, 3)."""
-        return cls(corners, np.roll(corners, -1, axis=0))
-
-    @cached_property
-    def centre(self) -> np.ndarray:
-        """The centre of mass (3,) of the line, which no symmetry moves."""
-        return np.average(self.middles, axis=0, weights=np.linalg.norm(self.steps, axis=1))
-
-    @cached_property
-    def _tree(self) -> cKDTree:
-        return cKDTree(self.middles)
+        self.centre = np.average(self.middles, axis=0, weights=np.linalg.norm(step, axis=1))  # no symmetry moves it
+        self._tree = cKDTree(self.middles)
 
     def centred(self) -> Border:
         """The same about its centre."""

@@ -14,8 +14,9 @@ import numpy as np
 
 from mmgsd.config import N_POINTS, RenderConfig
 from mmgsd.scene.blender import DeformedObject, add_attribute, add_mesh
-from mmgsd.scene.geometry import measure_arc
-from mmgsd.scene.objects.rope_shape import LENGTH, OwnPart, RopeShape, resample, sample_rope
+from mmgsd.scene.geometry import grid_faces, measure_arc
+from mmgsd.scene.objects.rope_physics import LENGTH, resample
+from mmgsd.scene.objects.rope_shape import RopeShape, own_parts, sample_rope
 
 RINGS = {"laid": 480, "braided": 400, "cable": 480}  # cross-sections of a strand
 SIDES = {"laid": 8, "braided": 6, "cable": 12}  # corners of a cross-section
@@ -41,12 +42,7 @@ class Lay:
     frayed: float = 0.0  # how far loose yarns reach beyond the ends, 0 for none
 
 
-@dataclass
-class Part:
-    """A grid-like surface: vertices (rings, sides, 3) in metres, closed around, and the kind of its faces."""
-
-    vertices: np.ndarray
-    kind: int
+Part = tuple[np.ndarray, int]  # vertices (rings, sides, 3) m of a surface that is closed around; its faces' kind
 
 
 def build_rope(rng: np.random.Generator, config: RenderConfig) -> DeformedObject:
@@ -56,17 +52,10 @@ def build_rope(rng: np.random.Generator, config: RenderConfig) -> DeformedObject
     shape = sample_rope(rng, ball=config.ball, slenderness=slenderness)
     lay = draw_workspace_lay(rng, LENGTH / shape.thickness) if workspace else draw_lay(rng)
     points = resample(shape.centre, N_POINTS)
-    info = {
-        "state": shape.state,
-        "n_crossings": len(shape.crossings),
-        "thickness": shape.thickness,
-        "lay": lay.kind,
-        "strands": lay.strands,
-        "pitch": lay.pitch * shape.thickness,
-        "length": LENGTH,
-    }
-    parts = build_parts(shape, lay)
-    return DeformedObject(add_parts(parts), points, shape.thickness, info, OwnPart(points, OWN_ARC * shape.thickness))
+    info = {"state": shape.state, "n_crossings": len(shape.crossings), "thickness": shape.thickness, "lay": lay.kind,
+            "strands": lay.strands, "pitch": lay.pitch * shape.thickness, "length": LENGTH}  # fmt: skip
+    mesh = add_parts(build_parts(shape, lay))
+    return DeformedObject(mesh, points, info, own_parts(points, OWN_ARC * shape.thickness), shape.thickness)
 
 
 def draw_lay(rng: np.random.Generator) -> Lay:
@@ -91,29 +80,27 @@ def draw_workspace_lay(rng: np.random.Generator, slenderness: float) -> Lay:
     return Lay("cable", 0, 1.0, 0.5, 0.0, 0, 0.0, plugs, plug)
 
 
-# --- geometry ---------------------------------------------------------------------------------------------------------
-
-
 def build_parts(shape: RopeShape, lay: Lay) -> list[Part]:
     """All surfaces of the rope, in metres: strands, a braid's core, bound ends, ball."""
     path = _extend(resample(shape.centre, RINGS[lay.kind]), OVERHANG * shape.thickness)
     side, up = _frame(path)
     arc = measure_arc(path) / shape.thickness
     cap = _cap(arc)
+    flatness = 1.45 if lay.kind == "braided" else 1.0  # width over height of a strand: a braid's are flat yarns
     parts = []
     for strand in range(lay.strands):
         offset = _strand_offset(lay, strand, arc)  # (R, 2) diameters
         out = (offset[:, :1] * side + offset[:, 1:] * up) * shape.thickness
-        tube = _sweep(path + out, out, lay.strand_radius * shape.thickness * cap, _flatness(lay), SIDES[lay.kind])
-        parts.append(Part(tube, ACCENT if strand < lay.accents else MAIN))
+        tube = _sweep(path + out, out, lay.strand_radius * shape.thickness * cap, flatness, SIDES[lay.kind])
+        parts.append((tube, ACCENT if strand < lay.accents else MAIN))
     if lay.kind == "cable":
-        parts.append(Part(_sweep(path, up, 0.5 * shape.thickness * cap, 1.0, SIDES["cable"]), MAIN))
+        parts.append((_sweep(path, up, 0.5 * shape.thickness * cap, 1.0, SIDES["cable"]), MAIN))
     parts += _plugs(path, side, up, arc, lay, shape.thickness) + _yarns(path, side, up, lay, shape.thickness)
     if lay.kind == "braided":
-        parts.append(Part(_sweep(path, up, 0.30 * shape.thickness * cap, 1.0, 8), MAIN))
+        parts.append((_sweep(path, up, 0.30 * shape.thickness * cap, 1.0, 8), MAIN))
     parts += _bindings(path, up, arc, lay.binding, shape.thickness)
     if shape.ball_radius:
-        parts.append(Part(_sphere(shape.centre[0], shape.ball_radius), BALL))
+        parts.append((_sphere(shape.centre[0], shape.ball_radius), BALL))
     return parts
 
 
@@ -137,11 +124,6 @@ def _cap(arc: np.ndarray) -> np.ndarray:
     """Share (R,) of a strand's radius that is left along arc length (diameters): round, melted tips."""
     to_end = np.minimum(arc, arc[-1] - arc)
     return np.sqrt(1 - (1 - np.clip(to_end / 0.3, 0, 1)) ** 2 * 0.998)
-
-
-def _flatness(lay: Lay) -> float:
-    """Width over height of a strand: a braid's are flat yarns."""
-    return 1.45 if lay.kind == "braided" else 1.0
 
 
 def _strand_offset(lay: Lay, strand: int, arc: np.ndarray) -> np.ndarray:
@@ -176,7 +158,7 @@ def _bindings(path: np.ndarray, up: np.ndarray, arc: np.ndarray, length: float, 
         band = np.flatnonzero((to_end > 0.2) & (to_end < 0.2 + length))
         shoulder = np.full(len(band), 0.515 * thickness)
         shoulder[[0, -1]] = 0.42 * thickness
-        parts.append(Part(_sweep(path[band], up[band], shoulder, 1.0, 16), ACCENT))
+        parts.append((_sweep(path[band], up[band], shoulder, 1.0, 16), ACCENT))
     return parts
 
 
@@ -191,7 +173,7 @@ def _plugs(
             radius = np.full(len(covered), lay.plug[0] * thickness)
             radius[[0, -1]] = 1e-4  # closed at both ends
             towards = up[covered] + (side[covered] if lay.plug[1] == 4 else 0)  # a box lies on a face, not on an edge
-            parts.append(Part(_sweep(path[covered], towards, radius, 1.0, lay.plug[1]), ACCENT))
+            parts.append((_sweep(path[covered], towards, radius, 1.0, lay.plug[1]), ACCENT))
     return parts
 
 
@@ -207,7 +189,7 @@ def _yarns(path: np.ndarray, side: np.ndarray, up: np.ndarray, lay: Lay, thickne
             yarn = path[end] + steps * out + spread * aside
             yarn[:, 2] = np.maximum(yarn[:, 2], 0.07 * thickness)
             towards = np.broadcast_to(up[end], yarn.shape)
-            parts.append(Part(_sweep(yarn, towards, np.full(6, 0.07 * thickness), 1.0, 4), MAIN))
+            parts.append((_sweep(yarn, towards, np.full(6, 0.07 * thickness), 1.0, 4), MAIN))
     return parts
 
 
@@ -219,21 +201,18 @@ def _sphere(centre: np.ndarray, radius: float) -> np.ndarray:
     return _sweep(path, across, radius * np.sqrt(1 - height**2), 1.0, 32)
 
 
-# --- mesh -------------------------------------------------------------------------------------------------------------
-
-
 def add_parts(parts: list[Part]) -> bpy.types.Object:
     """One smooth object of all parts, a material slot for each kind of face that occurs."""
     faces, kinds, places, start = [], [], [], 0
-    for part in parts:
-        rings, sides = part.vertices.shape[:2]
-        faces.append(start + grid_faces(rings, sides))
-        kinds.append(np.full(len(faces[-1]), part.kind))
+    for vertices, kind in parts:
+        rings, sides = vertices.shape[:2]
+        faces.append(start + grid_faces(rings, sides, closed=True))
+        kinds.append(np.full(len(faces[-1]), kind))
         along, around = np.mgrid[0 : 1 : rings * 1j, 0 : 1 : (sides + 1) * 1j][:, :, :-1]
         places.append(np.stack([along, around, 0 * along], axis=-1).reshape(-1, 3))
         start += rings * sides
-    vertices = np.concatenate([part.vertices.reshape(-1, 3) for part in parts])
-    rope = add_mesh("rope", vertices, np.concatenate(faces))
+    everything = np.concatenate([vertices.reshape(-1, 3) for vertices, _ in parts])
+    rope = add_mesh("rope", everything, np.concatenate(faces))
     add_attribute(rope.data, "along", np.concatenate(places))  # for images: along each part, and around it
     used, slots = np.unique(np.concatenate([[MAIN], *kinds]), return_inverse=True)
     for kind in used:
@@ -242,11 +221,3 @@ def add_parts(parts: list[Part]) -> bpy.types.Object:
     rope.data.polygons.foreach_set("use_smooth", np.ones(len(slots) - 1, dtype=bool))
     rope.data.update()
     return rope
-
-
-def grid_faces(rings: int, sides: int) -> np.ndarray:
-    """Quads ((rings - 1) * sides, 4) of a tube whose vertices run around each ring, ring by ring; normals outside."""
-    ring, side = np.mgrid[: rings - 1, :sides]
-    after = (side + 1) % sides
-    corners = [ring * sides + side, ring * sides + after, (ring + 1) * sides + after, (ring + 1) * sides + side]
-    return np.stack(corners, axis=-1).reshape(-1, 4)

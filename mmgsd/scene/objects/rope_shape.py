@@ -1,25 +1,23 @@
 """The rope's centre line: a random planar curve, laid over itself and relaxed until nothing cuts through.
 
 Pure numpy, in units of the rope's diameter until the last step. A curve is drawn as curvature over arc length; where
-it crosses itself one strand is lifted; then `rope_relax.py` settles it on the table. What still cuts through itself,
+it crosses itself one strand is lifted; then `rope_physics.py` settles it on the table. What still cuts through itself,
 pinches or is not in the state asked for is drawn again.
 """
 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
 from mmgsd.scene import SceneError
-from mmgsd.scene.geometry import find_middle, measure_arc
-from mmgsd.scene.objects.rope_relax import EXCLUDE, MIN_RADIUS, STEP, relax
-from mmgsd.scene.sampling import choose
+from mmgsd.scene.geometry import choose, find_middle, measure_arc
+from mmgsd.scene.objects.rope_physics import EXCLUDE, LENGTH, MIN_RADIUS, STEP, relax, resample
 
-LENGTH = 1.6  # m, of every rope
 USUAL = 50  # diameters that a rope is long; longer ones bend in wider turns
 STATES = {"straight": 0.10, "bent": 0.20, "heavily bent": 0.20, "loops": 0.25, "overhand knot": 0.25}  # probabilities
 PLANS = 50_000  # curves drawn for one rope at most; one with loops takes some 200 on average
@@ -37,28 +35,20 @@ class RopeShape:
     ball_radius: float  # metres, 0 without a ball; the ball's centre is centre[0]
 
 
-class OwnPart:
-    """Says of hits whether they lie on the part of the rope that belongs to a material point."""
-
-    def __init__(self, points: np.ndarray, reach: float) -> None:
-        """Material points (N, 3) m in order; reach: distance along the rope in m."""
-        self._tree = cKDTree(points)
-        self._steps = reach / np.linalg.norm(np.diff(points, axis=0), axis=1).mean()
-
-    def __call__(self, hits: np.ndarray, indices: np.ndarray) -> np.ndarray:
-        """First hits (K, 3) m of the rays to points ``indices`` (K,): whether each is that point's own (K,) bool."""
-        return np.abs(self._tree.query(hits)[1] - indices) <= self._steps
+def own_parts(points: np.ndarray, reach: float) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """Says whether first hits (K, 3) m are within ``reach`` of points ``indices`` (K,), along a rope (N, 3) m."""
+    tree, steps = cKDTree(points), reach / np.linalg.norm(np.diff(points, axis=0), axis=1).mean()
+    return lambda hits, indices: np.abs(tree.query(hits)[1] - indices) <= steps
 
 
 def sample_rope(
     rng: np.random.Generator, *, ball: bool = False, state: str | None = None,
     slenderness: tuple[float, float] = (32, 50),
 ) -> RopeShape:  # fmt: skip
-    """Draw a rope that rests on the table without cutting through itself.
+    """Draw a rope in one of `STATES` (None: any) that rests on the table without cutting through itself.
 
-    Args: rng: the only source of randomness; ball: leave room for a ball at the first end; state: one of STATES,
-    drawn if None; slenderness: range of its length in diameters.  Raises ValueError for an unknown state, SceneError
-    where no rope of the state comes about.
+    With a ``ball`` there is room for one at the first end; ``slenderness`` is the range of its length in diameters.
+    ValueError for an unknown state, SceneError where no rope of the state comes about.
     """
     if state is not None and state not in STATES:
         raise ValueError(f"state must be one of {', '.join(map(repr, STATES))}, got {state!r}")
@@ -73,15 +63,6 @@ def sample_rope(
             return shape
     raise SceneError(f"no rope in the state {state!r} with {count} crossings and a ball of {ball_radius:.2f} diameters "
                      f"came to lie: {PLANS} curves were drawn, or {SETTLED} suitable ones settled")  # fmt: skip
-
-
-def resample(points: np.ndarray, count: int) -> np.ndarray:
-    """Equally spaced points (count, 3) on the smooth curve through ``points`` (N, 3), end to end."""
-    for _ in range(2):  # the first pass measures arc length on chords, the second on a fine curve
-        arc = measure_arc(points)
-        points = CubicSpline(arc, points)(np.linspace(0, arc[-1], max(count, 4 * len(points))))
-    arc = measure_arc(points)
-    return CubicSpline(arc, points)(np.linspace(0, arc[-1], count))
 
 
 def find_crossings(xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -20,9 +20,6 @@ TABLE_COLOURS = (
 )  # fmt: skip
 
 
-# Linear. --------------------------------------------------------------------------------------------------------------
-
-
 def draw_colour(rng: np.random.Generator) -> Colour:
     """Greys, pale and vivid colours, never black: linear RGBA."""
     saturation = rng.choice([rng.uniform(0, 0.12), rng.uniform(0.1, 0.5), rng.uniform(0.5, 1.0)])
@@ -31,10 +28,7 @@ def draw_colour(rng: np.random.Generator) -> Colour:
 
 
 def draw_contrasting(rng: np.random.Generator, other: Colour, *, distance: float = 0.25, exempt: float = 0.1) -> Colour:
-    """A colour at least ``distance`` (of display range) from ``other``, but for a share ``exempt`` of the draws.
-
-    SceneError where there is none so far away.
-    """
+    """A colour ``distance`` (of display range) from ``other``, but for a share ``exempt`` of draws; or SceneError."""
     for _ in range(COLOURS):
         colour = draw_colour(rng)
         if rng.random() <= exempt or np.linalg.norm(_display(colour) - _display(other)) >= distance:
@@ -59,9 +53,6 @@ def _draw_shade(rng: np.random.Generator, amount: float) -> np.ndarray:
 def to_srgb(colour: Colour) -> tuple[int, int, int]:
     """sRGB, 0 to 255, of a linear colour."""
     return tuple(int(255 * c) for c in _display(colour))
-
-
-# sRGB. ----------------------------------------------------------------------------------------------------------------
 
 
 def draw_rgb(rng: np.random.Generator) -> RGB:

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from mmgsd.scene import environment_maps
-from mmgsd.scene.sampling import log_uniform
+from mmgsd.scene.geometry import choose, log_uniform
+from mmgsd.scene.lighting import draw_part
 from mmgsd.scene.textures.colours import RGB, draw_colour, draw_other_rgb, draw_rgb, to_linear, to_srgb, vary_rgb
 from mmgsd.scene.textures.procedural import draw_clutter
 
@@ -50,7 +50,7 @@ def load_photograph(name: str) -> np.ndarray:
 
 def paint_photograph(rng: np.random.Generator, colour: RGB) -> np.ndarray:
     """A part of a photograph or of an environment map, mirrored, turned and tinted at random."""
-    image = environment_maps.draw_part(rng, SIDE) if rng.random() < 0.3 else load_photograph(str(rng.choice(FILES)))
+    image = draw_part(rng, SIDE) if rng.random() < 0.3 else load_photograph(str(rng.choice(FILES)))
     side = int(rng.uniform(0.25, 1.0) * SIDE)
     left, top = rng.integers(0, SIDE - side + 1, size=2)
     part = np.rot90(image[top : top + side, left : left + side][:, :: rng.choice([-1, 1])], rng.integers(4))
@@ -144,7 +144,7 @@ def _font(size: int) -> ImageFont.ImageFont:
 
 def paint_cloth(rng: np.random.Generator, colour: RGB) -> tuple[np.ndarray, str]:
     """The face of a cloth, edge to edge, and the name of its pattern; hems, embroidery and stickers on some."""
-    name = str(rng.choice(list(FABRICS), p=list(SHARES.values())))
+    name = choose(rng, SHARES)
     image = Image.fromarray(np.ascontiguousarray(FABRICS[name](rng, colour)))
     pen = ImageDraw.Draw(image)
     if rng.random() < 0.35:
@@ -154,10 +154,6 @@ def paint_cloth(rng: np.random.Generator, colour: RGB) -> tuple[np.ndarray, str]
     if rng.random() < 0.22:
         _stick(rng, pen)
     return np.array(image), name
-
-
-def _plain(rng: np.random.Generator, colour: RGB) -> np.ndarray:
-    return np.full((SIDE, SIDE, 3), colour, dtype=np.uint8)
 
 
 def _mottled(rng: np.random.Generator, colour: RGB) -> np.ndarray:
@@ -222,8 +218,8 @@ def _quilted(rng: np.random.Generator, colour: RGB) -> np.ndarray:
 
 
 FABRICS: dict[str, Paint] = {
-    "plain": _plain, "mottled": _mottled, "striped": _striped, "plaid": _plaid, "printed": _printed,
-    "repeated": _repeated, "quilted": _quilted,
+    "plain": lambda rng, colour: np.full((SIDE, SIDE, 3), colour, dtype=np.uint8), "mottled": _mottled,
+    "striped": _striped, "plaid": _plaid, "printed": _printed, "repeated": _repeated, "quilted": _quilted,
 }  # fmt: skip
 SHARES = {
     "plain": 0.3, "mottled": 0.1, "striped": 0.16, "plaid": 0.08, "printed": 0.22, "repeated": 0.08, "quilted": 0.06,

@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from mmgsd.scene.blender import MASK_PASS
-from mmgsd.scene.sampling import log_uniform
+from mmgsd.scene.geometry import log_uniform
 from mmgsd.scene.textures.colours import Colour, draw_colour, draw_contrasting, to_srgb, vary_colour
 
 CLUTTER_PX = 512
@@ -50,6 +50,19 @@ class Shader:
         """Linear mix of two colours."""
         return self.node("MixRGB", {0: factor, 1: a, 2: b}).outputs[0]
 
+    def picture(self, pixels: np.ndarray, place: object, *, name: str = "picture", repeat: bool = True) -> object:
+        """The colour of a picture (H, W, 3) uint8 sRGB laid over the unit square of ``place``.
+
+        None of an earlier view is removed before the episode ends: Cycles would take a new one at its address for it.
+        """
+        height, width = pixels.shape[:2]
+        image = bpy.data.images.new(name, width, height)
+        rgba = np.ones((height, width, 4), dtype=np.float32)
+        rgba[..., :3] = pixels[::-1] / np.float32(255)
+        image.pixels.foreach_set(rgba.ravel())
+        extension = "REPEAT" if repeat else "EXTEND"
+        return self.node("TexImage", {"Vector": place}, image=image, extension=extension).outputs[0]
+
     def finish(self, colour: object, roughness: float, gloss: float, on_object: bool, normal: object = None) -> None:
         """Close the tree with a rough surface under a share ``gloss`` of shine; the mask learns what is the object."""
         relief = {} if normal is None else {"Normal": normal}
@@ -61,11 +74,12 @@ class Shader:
         self.node("OutputAOV", {"Value": float(on_object)}, aov_name=MASK_PASS)
 
 
+def draw_gloss(rng: np.random.Generator, chance: float, most: float) -> float:
+    """No shine, or with ``chance`` a share of at most ``most``."""
+    return float(rng.uniform(0.01, most)) if rng.random() < chance else 0.0
+
+
 # On the object. -------------------------------------------------------------------------------------------------------
-
-
-def _plain(rng: np.random.Generator, shader: Shader, colour: Colour) -> object:
-    return colour
 
 
 def _mottled(rng: np.random.Generator, shader: Shader, colour: Colour) -> object:
@@ -118,15 +132,11 @@ def _hemmed(rng: np.random.Generator, shader: Shader, colour: Colour) -> object:
 
 
 Texture = Callable[[np.random.Generator, Shader, Colour], object]
-OBJECT_TEXTURES: dict[str, Texture] = {"plain": _plain, "mottled": _mottled}
+OBJECT_TEXTURES: dict[str, Texture] = {"plain": lambda rng, shader, colour: colour, "mottled": _mottled}
 CLOTH_TEXTURES: dict[str, Texture] = {**OBJECT_TEXTURES, "woven": _woven, "gingham": _gingham, "hemmed": _hemmed}
 
 
 # On the floor. --------------------------------------------------------------------------------------------------------
-
-
-def _ground_plain(rng: np.random.Generator, shader: Shader, colour: Colour, place: object) -> object:
-    return colour
 
 
 def _ground_noise(rng: np.random.Generator, shader: Shader, colour: Colour, place: object) -> object:
@@ -166,13 +176,9 @@ def _ground_terrazzo(rng: np.random.Generator, shader: Shader, colour: Colour, p
 
 def _ground_clutter(rng: np.random.Generator, shader: Shader, colour: Colour, place: object) -> object:
     """A picture of random shapes, about two metres wide."""
-    pixels = np.ones((CLUTTER_PX, CLUTTER_PX, 4), dtype=np.float32)
-    pixels[..., :3] = np.asarray(draw_clutter(rng, colour), dtype=np.float32) / 255
-    # none of an earlier view is removed: Cycles would take a new one at its address for it
-    image = bpy.data.images.new("clutter", CLUTTER_PX, CLUTTER_PX)
-    image.pixels.foreach_set(pixels.ravel())
+    pixels = np.asarray(draw_clutter(rng, colour))[::-1]
     vector = shader.node("Mapping", {"Vector": place, "Scale": [rng.uniform(0.3, 0.8)] * 3}).outputs[0]
-    return shader.node("TexImage", {"Vector": vector}, image=image).outputs[0]
+    return shader.picture(pixels, vector, name="clutter")
 
 
 def draw_clutter(rng: np.random.Generator, colour: Colour) -> Image.Image:
@@ -195,11 +201,6 @@ def draw_clutter(rng: np.random.Generator, colour: Colour) -> Image.Image:
 
 Ground = Callable[[np.random.Generator, Shader, Colour, object], object]
 BACKGROUNDS: dict[str, Ground] = {
-    "plain": _ground_plain,
-    "noise": _ground_noise,
-    "wood": _ground_wood,
-    "tiles": _ground_tiles,
-    "checker": _ground_checker,
-    "terrazzo": _ground_terrazzo,
-    "clutter": _ground_clutter,
-}
+    "plain": lambda rng, shader, colour, place: colour, "noise": _ground_noise, "wood": _ground_wood,
+    "tiles": _ground_tiles, "checker": _ground_checker, "terrazzo": _ground_terrazzo, "clutter": _ground_clutter,
+}  # fmt: skip

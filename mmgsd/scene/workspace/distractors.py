@@ -13,8 +13,7 @@ from mathutils.bvhtree import BVHTree
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
-from mmgsd.scene.blender import Camera
-from mmgsd.scene.sampling import log_uniform
+from mmgsd.scene.geometry import Camera, log_uniform
 from mmgsd.scene.textures.colours import RGB, draw_rgb, vary_rgb
 from mmgsd.scene.workspace.materials import paint_plain, paint_surface
 from mmgsd.scene.workspace.primitives import (
@@ -146,12 +145,21 @@ def _scale(parts: list[Part], factor: float) -> list[Part]:
     return [(Solid(solid.vertices * factor, solid.faces, solid.smooth), *rest) for solid, *rest in parts]
 
 
+def _move(parts: list[Part], turn: float, place: tuple[float, float, float], *, lean: float = 0.0) -> list[Part]:
+    return [(move(solid, turn, place, lean=lean), *rest) for solid, *rest in parts]
+
+
+def _stack(parts: list[Part]) -> np.ndarray:
+    """The vertices (V, 3) m of all parts."""
+    return np.concatenate([solid.vertices for solid, *_ in parts])
+
+
 DISTRACTORS: dict[str, Maker] = {
     "box": _make_box, "disc": _make_disc, "mug": _make_mug, "book": _make_book, "pen": _make_pen,
     "weight": _make_weight, "textile": _make_textile, "cord": _make_cord,
 }  # fmt: skip
 OCCLUDERS: dict[str, Maker] = {"gripper": _make_gripper, "tool": _make_tool, "hand": _make_hand}
-ON_OBJECT: dict[str, Maker] = {name: DISTRACTORS[name] for name in ("pen", "weight", "disc", "box", "cord")}
+ON_OBJECT = ("pen", "weight", "disc", "box", "cord")
 
 
 # Places. --------------------------------------------------------------------------------------------------------------
@@ -184,9 +192,8 @@ def add_distractors(
 
 def add_occluder(rng: np.random.Generator, name: str, place: np.ndarray, *, lean: float, turn: float) -> None:
     """Put one of `OCCLUDERS` with its lowest point over a place (3,) m, leaning (rad) from z, turned (rad) about it."""
-    parts = [(move(solid, turn, (0, 0, 0), lean=lean), *rest) for solid, *rest in OCCLUDERS[name](rng)]
-    low = min(solid.vertices[:, 2].min() for solid, *_ in parts)
-    _add(rng, _move(parts, 0.0, (*place[:2], place[2] - low)))
+    parts = _move(OCCLUDERS[name](rng), turn, (0, 0, 0), lean=lean)
+    _add(rng, _move(parts, 0.0, (*place[:2], place[2] - _stack(parts)[:, 2].min())))
 
 
 def find_occluded(solids: list[Solid], points: np.ndarray, camera: Camera) -> np.ndarray:
@@ -204,27 +211,24 @@ def find_occluded(solids: list[Solid], points: np.ndarray, camera: Camera) -> np
 
 def _choose(rng: np.random.Generator, site: Site, beside: bool, over: bool) -> Iterator[tuple[str, Maker, Place]]:
     """Names, makers and placers of what is put around and on the object; no cord beside a rope, they are too alike."""
-    cords = {"cord"} if site.slender else set()
-    around = {name: maker for name, maker in DISTRACTORS.items() if name not in cords}
-    upon = {name: maker for name, maker in ON_OBJECT.items() if name not in cords}
+    around, upon = ([name for name in names if name != "cord" or not site.thickness]
+                    for names in (DISTRACTORS, ON_OBJECT))  # fmt: skip
     for _ in range(min(6, rng.poisson(1.6)) if beside else 0):
-        name = str(rng.choice(list(around)))
-        yield name, around[name], _place_beside
+        name = str(rng.choice(around))
+        yield name, DISTRACTORS[name], _place_beside
     for _ in range(int(rng.choice(len(OCCLUDER_COUNTS), p=OCCLUDER_COUNTS)) if over else 0):
-        kinds, place = (OCCLUDERS, _place_over) if rng.random() < 0.65 else (upon, _place_upon)
-        name = str(rng.choice(list(kinds)))
-        yield name, kinds[name], place
+        names, place = (list(OCCLUDERS), _place_over) if rng.random() < 0.65 else (upon, _place_upon)
+        name = str(rng.choice(names))
+        yield name, (DISTRACTORS | OCCLUDERS)[name], place
 
 
 def _place_beside(rng: np.random.Generator, site: Site, parts: list[Part]) -> list[Part] | None:
     """Standing somewhere in the picture, clear of the object; None where it is not."""
-    vertices = np.concatenate([solid.vertices for solid, *_ in parts])[:, :2]
     place, turn = site.ground_points[rng.integers(len(site.ground_points))], site.draw_turn(rng)
     moved = _move(parts, turn, (*place, -0.002))
-    outline = np.concatenate([solid.vertices for solid, *_ in moved])[:, :2]
-    gap = cKDTree(outline).query(site.points[::5, :2])[0].min()
+    gap = cKDTree(_stack(moved)[:, :2]).query(site.points[::5, :2])[0].min()
     inner = np.linalg.norm(site.points[:, :2] - place, axis=1).min()  # of a large thing with few vertices
-    return moved if gap > 0.02 and inner > 0.4 * np.ptp(vertices, axis=0).min() else None
+    return moved if gap > 0.02 and inner > 0.4 * np.ptp(_stack(parts)[:, :2], axis=0).min() else None
 
 
 def _place_over(rng: np.random.Generator, site: Site, parts: list[Part]) -> list[Part]:
@@ -232,16 +236,14 @@ def _place_over(rng: np.random.Generator, site: Site, parts: list[Part]) -> list
     place = site.points[rng.integers(len(site.points))]
     lean, turn = np.radians(rng.uniform(35, 84)), rng.uniform(0, 2 * np.pi)
     rolled = _move(parts, rng.choice([0, np.pi]), (0, 0, 0))
-    moved = [(move(solid, 0.0, (0, 0, 0), lean=lean), *rest) for solid, *rest in rolled]
-    low = min(solid.vertices[:, 2].min() for solid, *_ in moved)
-    return _move(moved, turn, (*place[:2], _find_top(site, place, 0.05) - low))
+    moved = _move(rolled, 0.0, (0, 0, 0), lean=lean)
+    return _move(moved, turn, (*place[:2], _find_top(site, place, 0.05) - _stack(moved)[:, 2].min()))
 
 
 def _place_upon(rng: np.random.Generator, site: Site, parts: list[Part]) -> list[Part]:
     """Lying on the object."""
     place, turn = site.points[rng.integers(len(site.points))], rng.uniform(0, 2 * np.pi)
-    reach = max(np.abs(solid.vertices[:, :2]).max() for solid, *_ in parts)
-    return _move(parts, turn, (*place[:2], _find_top(site, place, reach)))
+    return _move(parts, turn, (*place[:2], _find_top(site, place, np.abs(_stack(parts)[:, :2]).max())))
 
 
 def _find_top(site: Site, place: np.ndarray, reach: float) -> float:
@@ -250,17 +252,11 @@ def _find_top(site: Site, place: np.ndarray, reach: float) -> float:
     return float(site.points[near, 2].max()) + site.thickness + 0.003
 
 
-def _move(parts: list[Part], turn: float, place: tuple[float, float, float]) -> list[Part]:
-    return [(move(solid, turn, place), *rest) for solid, *rest in parts]
-
-
 def _is_clear(parts: list[Part], camera: Camera) -> bool:
     """Whether nothing stands near the lens."""
-    vertices = np.concatenate([solid.vertices for solid, *_ in parts])
-    depth = (vertices - camera.pose[:3, 3]) @ camera.pose[:3, 2]
-    aside = np.linalg.norm(vertices - camera.pose[:3, 3], axis=1)
-    height = camera.pose[2, 3]
-    return bool(aside.min() > 0.35 * height and depth[vertices[:, 2] < height].min(initial=1.0) > 0.1)
+    vertices, eye = _stack(parts), camera.pose[:3, 3]
+    depth, aside = (vertices - eye) @ camera.pose[:3, 2], np.linalg.norm(vertices - eye, axis=1)
+    return bool(aside.min() > 0.35 * eye[2] and depth[vertices[:, 2] < eye[2]].min(initial=1.0) > 0.1)
 
 
 def _add(rng: np.random.Generator, parts: list[Part]) -> None:

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mmgsd.scene.geometry import spin
-from mmgsd.scene.objects.rope import grid_faces
+from mmgsd.scene.geometry import grid_faces, spin
 
 
 @dataclass(frozen=True)
@@ -27,14 +26,12 @@ def make_box(size: np.ndarray | tuple[float, float, float], centre: tuple[float,
     return Solid(corners * size + centre, faces)
 
 
-def make_lathe(profile: np.ndarray, *, sides: int = 28, smooth: bool = False) -> Solid:
+def make_lathe(profile: np.ndarray) -> Solid:
     """A surface of revolution about z of a profile (R, 2) of radius and height, from the bottom outside to the top."""
-    angle = 2 * np.pi * np.arange(sides) / sides
-    round_ = np.stack([np.cos(angle), np.sin(angle)], axis=1)  # (sides, 2)
-    profile = np.asarray(profile, float)
-    across = profile[:, None, :1] * round_
-    height = np.broadcast_to(profile[:, None, 1:], (*across.shape[:2], 1))
-    return Solid(np.concatenate([across, height], axis=2).reshape(-1, 3), grid_faces(len(profile), sides), smooth)
+    angle = 2 * np.pi * np.arange(28) / 28
+    radius, height = np.asarray(profile, float).T[..., None]  # (R, 1) each
+    rings = np.stack([radius * np.cos(angle), radius * np.sin(angle), height + 0 * angle], axis=-1)  # (R, 28, 3)
+    return Solid(rings.reshape(-1, 3), grid_faces(len(rings), 28, closed=True))
 
 
 def make_tube(path: np.ndarray, radius: np.ndarray | float, *, sides: int = 10) -> Solid:
@@ -53,7 +50,7 @@ def make_tube(path: np.ndarray, radius: np.ndarray | float, *, sides: int = 10) 
     second /= np.maximum(np.linalg.norm(second, axis=1, keepdims=True), 1e-12)
     angle = 2 * np.pi * np.arange(sides)[None, :, None] / sides
     rings = path[:, None] + radius[:, None, None] * (np.cos(angle) * first[:, None] + np.sin(angle) * second[:, None])
-    return Solid(rings.reshape(-1, 3), grid_faces(len(path), sides), True)
+    return Solid(rings.reshape(-1, 3), grid_faces(len(path), sides, closed=True), True)
 
 
 def make_capsule(start: np.ndarray, end: np.ndarray, radius: float, tip: float | None = None) -> Solid:
@@ -77,16 +74,14 @@ def make_walls(outline: np.ndarray, bottom: float, top: float) -> Solid:
     return merge(parts)
 
 
-def make_textile(width: float, length: float, ripple: np.ndarray, *, cells: int = 24) -> Solid:
+def make_textile(width: float, length: float, ripple: np.ndarray) -> Solid:
     """A rectangle of cloth with waves of heights given at a grid (n, n) of its own, smoothly in between."""
-    v, u = np.mgrid[0 : 1 : (cells + 1) * 1j, 0 : 1 : (cells + 1) * 1j]
+    v, u = np.mgrid[0:1:25j, 0:1:25j]
     knots = np.linspace(0, 1, len(ripple))
-    rows = np.stack([np.interp(u[0], knots, line) for line in ripple])  # (n, cells + 1)
+    rows = np.stack([np.interp(u[0], knots, line) for line in ripple])  # (n, 25)
     height = np.stack([np.interp(v[:, 0], knots, column) for column in rows.T], axis=1)
     vertices = np.stack([(u - 0.5) * width, (v - 0.5) * length, height], axis=-1).reshape(-1, 3)
-    index = np.arange((cells + 1) ** 2).reshape(cells + 1, cells + 1)
-    faces = np.stack([index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]], axis=-1).reshape(-1, 4)
-    return Solid(vertices, faces, True)
+    return Solid(vertices, grid_faces(25, 25), True)
 
 
 def merge(parts: list[Solid]) -> Solid:

@@ -8,8 +8,7 @@ import bpy
 import numpy as np
 
 from mmgsd.scene.blender import add_floor, add_mesh
-from mmgsd.scene.geometry import find_middle, spin
-from mmgsd.scene.sampling import choose
+from mmgsd.scene.geometry import choose, find_middle, spin
 from mmgsd.scene.textures.colours import RGB, draw_other_rgb, draw_rgb, draw_table_rgb, vary_rgb
 from mmgsd.scene.workspace.materials import PREFIX, paint_plain, paint_surface
 from mmgsd.scene.workspace.primitives import Solid, make_box, make_walls, merge, move
@@ -28,8 +27,7 @@ class Site:
     turn: float  # rad, of the picture's axes about z
     ground_points: np.ndarray  # (K, 2) places on the ground that the picture shows
     colour: RGB  # mean of the object
-    thickness: float  # of the object above its points
-    slender: bool  # a rope: what looks like it must not lie about
+    thickness: float  # of a rope above its points: what looks like it must not lie about; 0 of a sheet
 
     @property
     def middle(self) -> np.ndarray:
@@ -49,22 +47,20 @@ class Site:
         return float(turn + rng.normal() * 0.03)
 
 
-def add_solid(solid: Solid, material: bpy.types.Material, name: str = "thing") -> Solid:
-    """Link a solid into the scene; returns it."""
+def add_solid(solid: Solid, material: bpy.types.Material, name: str = "thing") -> bpy.types.Object:
+    """Link a solid into the scene."""
     added = add_mesh(PREFIX + name, solid.vertices, solid.faces)
     added.data.materials.append(material)
     if solid.smooth:
         added.data.shade_smooth()
-    return solid
+    return added
 
 
 def add_plate(centre: np.ndarray, size: np.ndarray, turn: float, top: float, thickness: float,
               material: bpy.types.Material) -> None:  # fmt: skip
     """A board or a sheet; its picture lies along its own edges, whatever its turn."""
-    box = make_box((*size, thickness), (0, 0, -thickness / 2))
-    added = add_mesh(f"{PREFIX}plate", box.vertices, box.faces)
-    added.data.materials.append(material)
-    added.location, added.rotation_euler = (*centre, top), (0, 0, turn)
+    plate = add_solid(make_box((*size, thickness), (0, 0, -thickness / 2)), material, "plate")
+    plate.location, plate.rotation_euler = (*centre, top), (0, 0, turn)
 
 
 def add_surfaces(rng: np.random.Generator, site: Site) -> tuple[str, list[Solid], RGB | None]:
@@ -83,7 +79,9 @@ def add_surfaces(rng: np.random.Generator, site: Site) -> tuple[str, list[Solid]
         deep = 0.75 if kind == "table" else thick + 12 * STEP
         _add_floor(paint_surface(rng, draw_table_rgb(rng), fitted=False)[0], -deep)
         outline = _add_top(rng, site, kind, thick, main)
-        walls = _add_walls(rng, outline) if kind == "tray" else []
+        if kind == "tray":
+            walls = [make_walls(outline, -0.002, rng.uniform(0.01, 0.07))]
+            add_solid(walls[0], paint_plain(rng, draw_rgb(rng)), "walls")
     for level in range(int(rng.choice([0, 1, 2, 3], p=[0.35, 0.3, 0.2, 0.15]))):
         _add_mat(rng, site, -(1 + level) * STEP)
     if rng.random() < 0.15:
@@ -131,11 +129,6 @@ def _add_top(rng: np.random.Generator, site: Site, kind: str, thick: float, mate
     return centre + corners @ axes.T
 
 
-def _add_walls(rng: np.random.Generator, outline: np.ndarray) -> list[Solid]:
-    walls = make_walls(outline, -0.002, rng.uniform(0.01, 0.07))
-    return [add_solid(walls, paint_plain(rng, draw_rgb(rng)), "walls")]
-
-
 def _add_mat(rng: np.random.Generator, site: Site, top: float) -> None:
     """A mat, a paper or a board: as large as the object and square, or not; under it, half under it or beside it."""
     size = np.full(2, site.side * (rng.uniform(0.75, 1.25) if rng.random() < 0.5 else rng.uniform(0.15, 1.0)))
@@ -154,8 +147,6 @@ def _add_seams(rng: np.random.Generator, site: Site) -> None:
     material, turn = paint_plain(rng, draw_rgb(rng)), site.draw_turn(rng)
     width = float(rng.choice([0.004, 0.012, 0.05]))
     places = site.ground_points[rng.integers(len(site.ground_points), size=rng.integers(1, 4))]
-    bars = [
-        move(make_box((12, width, STEP / 2)), turn + rng.integers(2) * np.pi / 2, (*place, -STEP / 2))
-        for place in places
-    ]
+    bars = [move(make_box((12, width, STEP / 2)), turn + rng.integers(2) * np.pi / 2, (*place, -STEP / 2))
+            for place in places]  # fmt: skip
     add_solid(merge(bars), material, "seams")

@@ -9,18 +9,15 @@ The labels gain ``present``, ``things``, ``light`` and ``tilt_deg``; a point tha
 
 from __future__ import annotations
 
-import dataclasses
-
 import bpy
 import numpy as np
 from mathutils import Euler
 
 from mmgsd.config import RenderConfig
-from mmgsd.scene import blender, environment_maps, lighting
-from mmgsd.scene.blender import Camera, DeformedObject, View
-from mmgsd.scene.geometry import compute_direction, find_middle
+from mmgsd.scene import blender, lighting
+from mmgsd.scene.blender import DeformedObject, View
+from mmgsd.scene.geometry import Camera, choose, compute_direction, find_middle, log_uniform
 from mmgsd.scene.objects.cloth import EXTENT
-from mmgsd.scene.sampling import log_uniform
 from mmgsd.scene.workspace.distractors import add_distractors
 from mmgsd.scene.workspace.materials import paint_object, remove_view
 from mmgsd.scene.workspace.surfaces import Site, add_surfaces
@@ -41,7 +38,8 @@ def render_view(
     camera, turn, tilt = draw_camera(rng, deformed, size, config.rotation_deg)
     blender.place_camera(scene, camera)
     colour, texture = paint_object(rng, deformed.mesh)
-    site = _describe_site(rng, config, deformed, camera, turn, colour)
+    side = EXTENT if config.object == "cloth" else float(np.ptp(deformed.points[:, :2], axis=0).max())
+    site = Site(deformed.points, side, turn, sample_ground_points(rng, camera), colour, deformed.thickness / 2)
     ground, walls, masked = add_surfaces(rng, site)
     present = rng.random() >= ABSENT or masked is not None
     visible = blender.find_visible(deformed, bvh, camera)
@@ -53,26 +51,9 @@ def render_view(
     if masked is not None:
         image[~mask] = masked
     labels = {"turn_deg": np.degrees(turn), "tilt_deg": tilt, "texture": texture, "background": ground, "light": light}
-    return View(
-        image=image,
-        mask=mask,
-        xy=camera.project(deformed.points).astype(np.float32),
-        visible=visible & present,
-        intrinsics=camera.intrinsics,
-        camera_pose=camera.pose,
-        info={**deformed.info, **labels, "things": ", ".join(distractors), "present": present},
-    )
-
-
-def _describe_site(
-    rng: np.random.Generator, config: RenderConfig, deformed: DeformedObject, camera: Camera, turn: float,
-    colour: tuple[int, int, int],
-) -> Site:  # fmt: skip
-    span = float(np.ptp(deformed.points[:, :2], axis=0).max())
-    slender = deformed.is_own_hit is not None
-    thickness = deformed.visibility_radius / 2 if slender else 0.0
-    side = EXTENT if config.object == "cloth" else span
-    return Site(deformed.points, side, turn, sample_ground_points(rng, camera), colour, thickness, slender)
+    info = {**deformed.info, **labels, "things": ", ".join(distractors), "present": present}
+    xy = camera.project(deformed.points).astype(np.float32)
+    return View(image, mask, xy, visible & present, camera.intrinsics, camera.pose, info)
 
 
 def sample_ground_points(rng: np.random.Generator, camera: Camera) -> np.ndarray:
@@ -84,18 +65,12 @@ def sample_ground_points(rng: np.random.Generator, camera: Camera) -> np.ndarray
     return eye[:2] - rays[down, :2] * (eye[2] / rays[down, 2:])
 
 
-# Camera. --------------------------------------------------------------------------------------------------------------
-
-
 def draw_camera(
     rng: np.random.Generator, deformed: DeformedObject, size: tuple[int, int], rotation_deg: float
 ) -> tuple[Camera, float, float]:
-    """A camera that sees the object obliquely and from near, its turn (rad, within ± rotation_deg) and tilt (degrees).
-
-    The object spans a fifth to all of the picture, at most ``MAX_OUTSIDE`` of its points are outside.
-    """
+    """A camera from near that has the object in a fifth to all of the picture, its turn (rad) and tilt (degrees)."""
     points, turn = deformed.points, np.radians(rng.uniform(-rotation_deg, rotation_deg))
-    thin = deformed.visibility_radius if deformed.is_own_hit is not None else np.inf
+    thin = deformed.thickness or np.inf
     for _ in range(TRIES):
         tilt = abs(rng.normal(scale=5.0)) if rng.random() < 0.35 else rng.uniform(0, MAX_TILT_DEG)
         tilt = min(tilt, MAX_TILT_DEG)
@@ -131,52 +106,35 @@ def frame_points(
     return Camera.build(rotation, middle + rotation @ np.array([*aside, -distance]), focal, size)
 
 
-# Light. ---------------------------------------------------------------------------------------------------------------
-
-
-@dataclasses.dataclass(frozen=True)
-class _Lighting:
-    """How bright (of a white sheet), which share comes from all around, how wide the lamp is (m, or degrees)."""
-
-    exposure: tuple[float, float]
-    ambient: tuple[float, float]
-    width: tuple[float, float]
-    share: float  # of the views
-
-
 MAPPED = 0.35  # share of the views under an environment map, half of them beside a lamp of `LIGHTS`
-LIGHTS = {
-    "even": _Lighting((0.7, 1.2), (0.6, 1.0), (10.0, 60.0), 0.3),
-    "sun": _Lighting((0.7, 1.5), (0.12, 0.4), (0.4, 3.0), 0.25),
-    "lamp": _Lighting((0.6, 1.5), (0.1, 0.5), (0.03, 0.5), 0.27),
-    "glare": _Lighting((1.6, 3.0), (0.2, 0.6), (0.4, 10.0), 0.08),
-    "dim": _Lighting((0.2, 0.5), (0.3, 0.9), (0.1, 0.6), 0.1),
+LIGHTS = {  # share of the views; how bright (of a white sheet), which share from all around, how wide (m, or degrees)
+    "even": (0.3, (0.7, 1.2), (0.6, 1.0), (10.0, 60.0)),
+    "sun": (0.25, (0.7, 1.5), (0.12, 0.4), (0.4, 3.0)),
+    "lamp": (0.27, (0.6, 1.5), (0.1, 0.5), (0.03, 0.5)),
+    "glare": (0.08, (1.6, 3.0), (0.2, 0.6), (0.4, 10.0)),
+    "dim": (0.1, (0.2, 0.5), (0.3, 0.9), (0.1, 0.6)),
 }
 
 
 def draw_light(rng: np.random.Generator, scene: bpy.types.Scene, side: float, target: np.ndarray) -> str:
-    """Light the object at ``target`` (3,) m, warm, cold or coloured: with a sun or a lamp near by, or all around it.
-
-    Returns the light's name.
-    """
+    """Light the object at ``target`` (3,) m with a sun or a lamp near by, or all around it; the light's name."""
     mapped = rng.random() < MAPPED
     if mapped and rng.random() < 0.5:
         lighting.remove_lamp()
-        return environment_maps.light_world(rng, scene, log_uniform(rng, 0.5, 1.4), _draw_tint(rng))
-    name = str(rng.choice(list(LIGHTS), p=[light.share for light in LIGHTS.values()]))
-    light = LIGHTS[name]
-    exposure, ambient = log_uniform(rng, *light.exposure), rng.uniform(*light.ambient)
+        return lighting.light_world(rng, scene, log_uniform(rng, 0.5, 1.4), _draw_tint(rng))
+    name = choose(rng, {name: share for name, (share, *_) in LIGHTS.items()})
+    _, bright, around, wide = LIGHTS[name]
+    exposure, ambient = log_uniform(rng, *bright), rng.uniform(*around)
     colour = _draw_tint(rng)
     sky = np.sqrt(colour) if rng.random() < 0.5 else colour
     if mapped:
-        name = f"{name}, {environment_maps.light_world(rng, scene, exposure * ambient, sky)}"
+        name = f"{name}, {lighting.light_world(rng, scene, exposure * ambient, sky)}"
     else:
-        environment_maps.remove_map(scene)
         lighting.set_world(scene, (*np.clip(sky, 0, 2).tolist(), 1.0), exposure * ambient)
     direction = compute_direction(np.radians(rng.uniform(20, 85)), rng.uniform(0, 2 * np.pi))
-    width, distance = rng.uniform(*light.width), rng.uniform(0.8, 3.0) * max(side, 0.5)
-    near = light.width[1] < 1  # m, of a lamp; a sun's are degrees
-    lamp = lighting.add_lamp(scene, *(("AREA", width * max(side, 0.5)) if near else ("SUN", np.radians(width))))
+    width, distance = rng.uniform(*wide), rng.uniform(0.8, 3.0) * max(side, 0.5)
+    near = wide[1] < 1  # m, of a lamp; a sun's are degrees
+    lamp = lighting.add_lamp(*(("AREA", width * max(side, 0.5)) if near else ("SUN", np.radians(width))))
     exposure *= 1 - ambient
     lighting.aim_lamp(lamp, target, direction, distance, colour=np.clip(colour, 0, 2), exposure=exposure)
     return name

@@ -47,6 +47,12 @@ def turn_corners(outline: list, degrees: float, *, digits: int = 2) -> list:
     return (np.array(outline) @ turn(degrees)[:2, :2].T).round(digits).tolist()
 
 
+def measure_ring(outline: list) -> float:
+    """The area that an outline encloses, its longest side 1."""
+    x, y = (np.array(outline) / np.ptp(outline, axis=0).max()).T
+    return 0.5 * np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)
+
+
 def measure_area(planar: PlanarObject) -> float:
     a, b, c = (planar.rest[planar.faces[:, k], :2] for k in range(3))
     return float(0.5 * np.sum((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]))
@@ -100,8 +106,7 @@ def test_round_outlines_have_the_largest_group_that_fits(
 ) -> None:
     planar = load_planar_object(save(tmp_path, outline=outline, symmetry=symmetry))
     assert planar.group.order == order
-    x, y = (np.array(outline) / np.ptp(outline, axis=0).max()).T
-    assert measure_area(planar) == pytest.approx(0.5 * np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y), rel=0.02)
+    assert measure_area(planar) == pytest.approx(measure_ring(outline), rel=0.02)
 
 
 @pytest.mark.parametrize("degrees", [0.0, 21.7])
@@ -138,10 +143,8 @@ def test_symmetric_points_lie_where_the_turn_moves_them(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["towel", "tshirt"])
 def test_the_shipped_objects_are_well_meshed(name: str) -> None:
     planar = load_planar_object(OBJECTS / f"{name}.json")
-    outline = np.array(json.loads((OBJECTS / f"{name}.json").read_text())["outline"]) / 1.0
-    x, y = (outline / np.ptp(outline, axis=0).max()).T
-    area = 0.5 * np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)
-    assert measure_area(planar) == pytest.approx(area, rel=0.01)
+    outline = json.loads((OBJECTS / f"{name}.json").read_text())["outline"]
+    assert measure_area(planar) == pytest.approx(measure_ring(outline), rel=0.01)
     assert np.ptp(planar.rest, axis=0).max() == pytest.approx(1.0, abs=1e-6)
     edges = np.linalg.norm(planar.rest[planar.faces[:, 0]] - planar.rest[planar.faces[:, 1]], axis=1)
     assert edges.min() > 0.5 * SPACING
@@ -175,11 +178,7 @@ def test_json_gives_the_same_sheet() -> None:
     again = PlanarObject.from_dict(json.loads(json.dumps(planar.to_dict())))
     np.testing.assert_array_equal(again.rest, planar.rest)
     np.testing.assert_array_equal(again.group.permutations, planar.group.permutations)
-    assert (again.name, again.size, again.either_face) == (
-        planar.name,
-        planar.size,
-        planar.either_face,
-    )
+    assert (again.name, again.size, again.either_face) == (planar.name, planar.size, planar.either_face)
 
 
 def test_turning_over_about_an_axis_leaves_the_axis() -> None:
@@ -207,7 +206,6 @@ def test_turning_over_about_an_axis_leaves_the_axis() -> None:
         ({"outline": [[0, 0], [1, 0], [1, True]], "symmetry": "turns"}, "finite numbers, got .1, True. as corner 3"),
         ({"outline": [*TOWEL, [float("nan"), 1]], "symmetry": "turns"}, "finite numbers, got .nan, 1. as corner 5"),
         ({"outline": [*TOWEL, [10**400, 1]], "symmetry": "turns"}, "finite numbers"),
-        ({"outline": [*TOWEL, [1, 2, 3]], "symmetry": "turns"}, "each corner must be"),
         ({"outline": [TOWEL] * 3, "symmetry": "turns"}, "holes are not accepted"),
         ({"outline": [TOWEL], "symmetry": "turns"}, "3 or more corners .*got 1 of them"),
         ({"outline": {"type": "Polygon", "coordinates": [TOWEL]}, "symmetry": "turns"}, "outline must be a list"),
@@ -219,7 +217,6 @@ def test_turning_over_about_an_axis_leaves_the_axis() -> None:
         ({"outline": [*TOWEL[:2], [45, 25], *TOWEL[2:], [45, 25]], "symmetry": "turns"}, "cross or touch itself"),
         ({"outline": [*TOWEL[:2], [150, 0], *TOWEL[1:]], "symmetry": "turns"}, "cross or touch itself"),
         ({"outline": TOWEL, "symmetry": 7}, "symmetry must be .*got 7"),
-        ({"outline": TOWEL, "symmetry": None}, "symmetry must be"),
         ({"outline": TOWEL, "symmetry": [{"turn_deg": "90"}]}, "symmetry: an entry must be"),
         ({"outline": TOWEL, "symmetry": [{"turn_deg": float("inf")}]}, "symmetry: an entry must be"),
         ({"outline": TOWEL, "symmetry": [["a"] * 16]}, "symmetry: an entry must be"),
@@ -231,12 +228,10 @@ def test_turning_over_about_an_axis_leaves_the_axis() -> None:
         ({"mesh": "grid.obj", "symmetry": {"permutations": [[1, 0], [0, 1]]}}, "rows of 740"),
         ({"mesh": "grid.obj", "symmetry": {"permutations": [[0]] * 25}}, "1 to 24 lists"),
         ({"outline": TOWEL, "symmetry": "turns", "image_size": "a"}, "image_size must be two integers .*got 'a'"),
-        ({"outline": TOWEL, "symmetry": "turns", "image_size": 5}, "image_size must be two integers .*got 5"),
         ({"outline": TOWEL, "symmetry": "turns", "image_size": [485.0, 485]}, "image_size"),
         ({"outline": TOWEL, "symmetry": "turns", "up": "y"}, "up must be one of z, y, beside mesh"),
         ({"mesh": "grid.obj", "symmetry": "turns", "up": "x"}, "up must be one of z, y.*got 'x'"),
         ({"mesh": 5, "symmetry": "turns"}, "mesh must be the name of an OBJ file beside this one.*got 5"),
-        ({"mesh": "", "symmetry": "turns"}, "mesh must be the name"),
         ({"mesh": "../grid.obj", "symmetry": "turns"}, "mesh must be the name .*no absolute path"),
         ({"mesh": "a/../../grid.obj", "symmetry": "turns"}, "mesh must be the name"),
         ({"mesh": "/etc/passwd", "symmetry": "turns"}, "mesh must be the name"),
@@ -265,21 +260,10 @@ def test_a_byte_order_mark_and_a_mesh_in_a_folder_are_read(tmp_path: Path) -> No
     assert load_planar_object(path).group.order == 2
 
 
-def test_a_coarse_mesh_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "grid.obj").write_text(grid_obj(5, 9))
-    with pytest.raises(ValueError, match="remesh"):
-        load_planar_object(save(tmp_path, mesh="grid.obj", symmetry="turns"))
-
-
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"none\.json"):
-        load_planar_object(tmp_path / "none.json")
-
-
 @pytest.mark.parametrize(("name", "meant"), [("colth", "cloth"), ("ropes", "rope"), ("dishclth", "dishcloth")])
 def test_the_nearest_name_is_given_where_an_objects_file_is_missing(tmp_path: Path, name: str, meant: str) -> None:
     (tmp_path / "dishcloth.json").write_text("{}")
-    with pytest.raises(FileNotFoundError, match=f"did you mean '{meant}'.*there are cloth, dishcloth, rope"):
+    with pytest.raises(FileNotFoundError, match=rf"{name}\.json .*did you mean '{meant}'.*cloth, dishcloth, rope"):
         load_planar_object(tmp_path / f"{name}.json")
 
 

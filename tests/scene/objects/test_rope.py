@@ -1,4 +1,4 @@
-"""The rope's shape, in pure numpy; one test renders in a child process."""
+"""The rope's shape and physics, in pure numpy; one test renders in a child process."""
 
 import subprocess
 import sys
@@ -6,9 +6,11 @@ import sys
 import numpy as np
 import pytest
 
+from mmgsd.fold.tasks import TASKS
 from mmgsd.scene import SceneError
 from mmgsd.scene.objects import rope_shape
-from mmgsd.scene.objects.rope_shape import LENGTH, STATES, OwnPart, RopeShape, find_crossings, resample, sample_rope
+from mmgsd.scene.objects.rope_physics import LENGTH, bend, pull_rope, resample
+from mmgsd.scene.objects.rope_shape import STATES, RopeShape, find_crossings, own_parts, sample_rope
 
 SEEDS = 60
 
@@ -78,7 +80,7 @@ def test_material_points_are_equally_spaced(ropes: list[RopeShape]) -> None:
 
 def test_only_the_upper_part_of_a_crossing_is_visible(ropes: list[RopeShape]) -> None:
     for shape in (shape for shape in ropes if len(shape.crossings)):
-        own = OwnPart(shape.centre, 2 * shape.thickness)
+        own = own_parts(shape.centre, 2 * shape.thickness)
         visible = own(hits_from_above(shape), np.arange(len(shape.centre)))
         above, below = shape.crossings.T
         assert visible[above].all() and not visible[below].any()
@@ -149,3 +151,47 @@ def test_centre_line_lies_in_the_rendered_mask(episode: int, ball: bool) -> None
     in_mask, visible = child.stdout.split("share in mask")[1].split()[:2]
     assert float(in_mask) >= 0.99
     assert float(visible) >= 0.8
+
+
+# Under grippers. ------------------------------------------------------------------------------------------------------
+
+
+def measure_length(centre):
+    return np.linalg.norm(np.diff(centre, axis=0), axis=1).sum()
+
+
+def carry(shape, task):
+    """The look's grasps from wherever the points are to the task's places."""
+    moves = TASKS[task].looks[0]
+    return [(move.pick, np.array(move.place) - shape.centre[move.pick, :2]) for move in moves]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_straightening_pulls_the_ends_apart_and_does_not_stretch(seed):
+    shape = sample_rope(np.random.default_rng(seed), state="heavily bent")
+    _, pulled = pull_rope(shape.centre, shape.thickness, carry(shape, "straighten"))
+    before, after = (np.linalg.norm(centre[-1] - centre[0]) for centre in (shape.centre, pulled))
+    assert after > 1.25 * before and after > 0.97 * LENGTH
+    assert measure_length(pulled) == pytest.approx(LENGTH, rel=0.02)
+
+
+def test_both_ends_come_to_lie_where_they_are_put_and_the_middle_stays():
+    shape = sample_rope(np.random.default_rng(0), state="straight")
+    _, folded = pull_rope(shape.centre, shape.thickness, carry(shape, "ends"))
+    for move in TASKS["ends"].looks[0]:
+        assert np.linalg.norm(folded[move.pick, :2] - move.place) < 0.05
+    assert np.linalg.norm(folded[312] - shape.centre[312]) < 0.05
+    assert folded[:, 2].min() >= 0.45 * shape.thickness and folded[:, 2].max() < 2.5 * shape.thickness
+    assert measure_length(folded) == pytest.approx(LENGTH, rel=0.05)
+
+
+def test_without_grasps_a_rope_stays_nearly_as_it_lies():
+    shape = sample_rope(np.random.default_rng(1), state="bent")
+    _, left = pull_rope(shape.centre, shape.thickness, [])
+    assert np.linalg.norm(left - shape.centre, axis=1).max() < 0.05
+
+
+def test_a_particle_whose_neighbours_are_at_one_place_stays_finite():
+    points = np.array([[0.0, 0, 0.5], [0.5, 0, 0.5], [0.0, 0, 0.5], [0.5, 0, 0.5], [1.0, 0, 0.5]])  # grippers met
+    bend(points, 0.0, 1)
+    assert np.isfinite(points).all()
