@@ -13,7 +13,6 @@ import dataclasses
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,38 +20,20 @@ import numpy as np
 import pandas as pd
 import torch
 
+from mmgsd import files
 from mmgsd.checks import check, read_count, read_flag
 from mmgsd.config import CONTRASTIVE, MATCHES_OF_ONE
 from mmgsd.dataset import Dataset, join_datasets, load_dataset
-from mmgsd.files import (
-    ASIDE,
-    ForeignFileError,
-    locked,
-    read_json,
-    remove_folder,
-    saying_what_stays,
-    write_json,
-    write_text,
-)
 from mmgsd.learn.augmentation import load_training_images, make_batch
 from mmgsd.learn.checkpoints import CHECKPOINT
 from mmgsd.learn.distributed import World
 from mmgsd.learn.objective import compute_head_loss, compute_loss, compute_place_loss
-from mmgsd.learn.photographs import add_points, check_photographs, join_batches, prepare_photographs, take
+from mmgsd.learn.photographs import add_points, join_batches, prepare_photographs, take
 from mmgsd.learn.training import Run, repeatable
 from mmgsd.match.matcher import Matcher, find_weights
+from mmgsd.measure import photographs as measured
 from mmgsd.measure.calibration import calibrate_modes, describe_places
-from mmgsd.measure.photographs import (
-    ENDS,
-    MEASURES,
-    Photograph,
-    ask_photographs,
-    digest_marks,
-    estimate_intervals,
-    read_all_photographs,
-    score_answer,
-    summarise_photographs,
-)
+from mmgsd.measure.photographs import Photograph
 from mmgsd.measure.questions import measure_rmse
 from mmgsd.model.network import find_device, name_hardware
 from mmgsd.model.tensors import load_metadata, read_tensors, write_tensors
@@ -119,21 +100,25 @@ def adapt(
     overwrite, progress, out = read_flag("overwrite", overwrite), read_flag("progress", progress), Path(out)
     source = find_weights(weights)
     start = Matcher.load(source, device=find_device(device))
-    check("weights", start.config.method, "of a method that is taught all matches", _knows_all(start))
+    all_known = start.config.method not in MATCHES_OF_ONE
+    check("weights", start.config.method, "of a method that is taught all matches", all_known)
     kind = start.object or start.config.object
-    photographs = read_all_photographs(folder, kind)
-    check_photographs(photographs, kind)
+    photographs = measured.read_all_photographs(folder, kind)
+    if len(photographs) < 2:  # nothing that is learnt from a single one need hold in another
+        raise ValueError(f"folder must hold at least two photographs of kind {kind!r}, got {len(photographs)}")
     asked = _describe_asked(source, photographs, renders, steps=steps, folds=folds, seed=seed)
     if not overwrite and _is_finished(out, asked, source):
         return out
     work = out.with_name(f"{out.stem}.adapting")
-    with locked(work, "adapting"), repeatable(start.device):
-        _open_work(work, asked)
+    with files.locked(work, "adapting"), repeatable(start.device):
+        if (work / ASKED).is_file() and files.read_json(work / ASKED) != asked:
+            files.remove_folder(work, _is_ours)
+        files.write_json(work / ASKED, asked)
         job = _Job(start, photographs, _load_renders(kind, renders), work, asked, progress)
-        with saying_what_stays(lambda: f"what was learnt is kept in {work}: the same call goes on"):
+        with files.saying_what_stays(lambda: f"what was learnt is kept in {work}: the same call goes on"):
             found = job.measure()
             job.finish(out, source, found)
-        remove_folder(work, _is_ours)
+        files.remove_folder(work, _is_ours)
     return out
 
 
@@ -145,16 +130,12 @@ def read_adaptation(weights: Path | str) -> dict[str, Any]:
     return json.loads(note["adapted"])
 
 
-def _knows_all(matcher: Matcher) -> bool:
-    return matcher.config.method not in MATCHES_OF_ONE
-
-
 def _describe_asked(source: Path, photographs: Sequence[Photograph], renders: Any, **asked: int) -> dict[str, Any]:
     """What decides the result: the same asked again is not done again."""
     pixels = hashlib.sha256()
     for photograph in photographs:
         pixels.update(photograph.path.read_bytes())
-    marks = {"marks_digest": digest_marks(list(photographs)), "files_digest": pixels.hexdigest()[:16]}
+    marks = {"marks_digest": measured.digest_marks(list(photographs)), "files_digest": pixels.hexdigest()[:16]}
     weights = {"source": source.name, "sha256": hashlib.sha256(source.read_bytes()).hexdigest()}
     return {**weights, **marks, **asked, **({"renders": str(renders)} if renders else {})}
 
@@ -165,7 +146,7 @@ def _is_finished(out: Path, asked: dict[str, Any], source: Path) -> bool:
     check("out", str(out), "a path that ends with .safetensors, and not the weights to go on from",
           out.suffix == ".safetensors" and out.resolve() != source.resolve())  # fmt: skip
     if card.is_file() and not card.read_text("utf-8", "replace").startswith(f"# {out.name}\n"):
-        raise ForeignFileError(f"{card} is no card of {out.name}: move it away, or choose another name")
+        raise files.ForeignFileError(f"{card} is no card of {out.name}: move it away, or choose another name")
     if not out.is_file():
         return False
     if json.loads(load_metadata(out).get("adapted", "{}")).get("asked") != asked:
@@ -174,15 +155,8 @@ def _is_finished(out: Path, asked: dict[str, Any], source: Path) -> bool:
     return True
 
 
-def _open_work(work: Path, asked: dict[str, Any]) -> None:
-    """Make the folder of what is done so far; what it has of anything else that was asked for goes."""
-    if (work / ASKED).is_file() and read_json(work / ASKED) != asked:
-        remove_folder(work, _is_ours)
-    write_json(work / ASKED, asked)
-
-
 def _is_ours(path: Path) -> bool:
-    return path.suffix == ".json" or path.name.startswith(CHECKPOINT) or bool(ASIDE.fullmatch(path.name))
+    return path.suffix == ".json" or path.name.startswith(CHECKPOINT) or bool(files.ASIDE.fullmatch(path.name))
 
 
 def _load_renders(kind: str, folder: Path | str | None) -> dict[str, Dataset]:
@@ -201,35 +175,26 @@ class Found(NamedTuple):
     rmse_px: float  # on renders
 
 
-def _read_found(file: Path) -> Found:
-    values = read_json(file)
-    return Found(pd.DataFrame(values["rows"]), values["rmse_px"])
-
-
-@dataclass
 class _Job:
-    """One call of `adapt`: its materials, and where it keeps what is done of it."""
+    """One call of `adapt`: its materials, and the folder ``work`` where it keeps what is done of it."""
 
-    start: Matcher
-    photographs: list[Photograph]
-    renders: dict[str, Dataset]
-    work: Path
-    asked: dict[str, Any]
-    progress: bool
-
-    def __post_init__(self) -> None:
-        train, config = self.renders["train"], self.start.config
-        group = train.group(config.group)
-        self.own, self.permutations = prepare_photographs(self.photographs, self.start, group)
+    def __init__(
+        self, start: Matcher, photographs: list[Photograph], renders: dict[str, Dataset], work: Path,
+        asked: dict[str, Any], progress: bool,
+    ) -> None:  # fmt: skip
+        self.start, self.photographs, self.renders = start, photographs, renders
+        self.work, self.asked, self.progress = work, asked, progress
+        train, config = renders["train"], start.config
+        self.own, self.permutations = prepare_photographs(photographs, start, train.group(config.group))
         self.kept = add_points(load_training_images(train, config.input_px), self.permutations.shape[1])
-        if self.start.places is None or len(self.start.places) != train.n_points:
-            self.start.places = describe_places(self.start, train)
-        self.marked = [k for k, photograph in enumerate(self.photographs) if len(photograph.xy)]
-        parts, steps = min(self.asked["folds"], len(self.marked)), self.asked["steps"]
+        if start.places is None or len(start.places) != train.n_points:
+            start.places = describe_places(start, train)
+        self.marked = [k for k, photograph in enumerate(photographs) if len(photograph.xy)]
+        parts, steps = min(asked["folds"], len(self.marked)), asked["steps"]
         self.parts = parts if parts > 1 else 0
         self.stops = [round(steps * k / STOPS) for k in range(STOPS + 1)]
         self.config = dataclasses.replace(
-            config, steps=steps, seed=self.asked["seed"], learning_rate=RATE, optimiser="adamw", schedule="cosine",
+            config, steps=steps, seed=asked["seed"], learning_rate=RATE, optimiser="adamw", schedule="cosine",
             groups=1, sigma_px=SIGMA_PX, sigma_start_px=SIGMA_PX, augment=True,
         )  # fmt: skip
 
@@ -245,20 +210,19 @@ class _Job:
         chosen = [k for k in range(len(self.photographs)) if k not in left_out]
         folder = self.work / f"part{number}"
         sources, targets = ([self.photographs[k] for k in ks if k in self.marked] for ks in (chosen, left_out))
-        if (folder / RESULT.format(self.stops[-1])).is_file():
-            return {stop: _read_found(folder / RESULT.format(stop)) for stop in self.stops}
-        run, found = _Adaptation(self, chosen, folder), {}
-        run.resume()
-        for stop in self.stops:
-            self.advance(run, stop, f"adapt, without part {number + 1} of {self.parts}")
-            file = folder / RESULT.format(stop)
-            if not file.is_file():
-                matcher = run.make_matcher()
-                rows = ask_left_out(matcher, sources, targets).to_dict("records")
-                rmse_px = measure_rmse(matcher, self.renders["test"], **QUESTIONS)
-                write_json(file, {"rows": rows, "rmse_px": rmse_px}, indent=None)
-            found[stop] = _read_found(file)
-        return found
+        results = {stop: folder / RESULT.format(stop) for stop in self.stops}
+        if not results[self.stops[-1]].is_file():
+            run = _Adaptation(self, chosen, folder)
+            run.resume()
+            for stop, file in results.items():
+                self.advance(run, stop, f"adapt, without part {number + 1} of {self.parts}")
+                if not file.is_file():
+                    matcher = run.make_matcher()
+                    rows = ask_left_out(matcher, sources, targets).to_dict("records")
+                    rmse_px = measure_rmse(matcher, self.renders["test"], **QUESTIONS)
+                    files.write_json(file, {"rows": rows, "rmse_px": rmse_px}, indent=None)
+        found = {stop: files.read_json(file) for stop, file in results.items()}
+        return {stop: Found(pd.DataFrame(values["rows"]), values["rmse_px"]) for stop, values in found.items()}
 
     def advance(self, run: _Adaptation, stop: int, name: str) -> None:
         """Take the steps that are left to ``stop``."""
@@ -290,7 +254,7 @@ class _Job:
             "found": summarise_change(found), "seconds": round(run.seconds, 1),
             "hardware": name_hardware(self.start.device),
         }  # fmt: skip
-        write_text(out.with_suffix(".md"), make_card(out.name, told))
+        files.write_text(out.with_suffix(".md"), make_card(out.name, told))
         write_tensors(out, tensors, note | {"adapted": json.dumps(told)})
 
 
@@ -353,11 +317,9 @@ class _Adaptation(Run):
 
 def ask_left_out(matcher: Matcher, sources: list[Photograph], targets: list[Photograph]) -> pd.DataFrame:
     """A row a query about the targets, "by" a "picture" of the sources or by "name"."""
-    tables = [score_answer(answer, photograph).assign(by="picture")
-              for photograph, answer in ask_photographs(matcher, sources, targets=targets, progress=False)]  # fmt: skip
-    if matcher.object in ENDS and matcher.places is not None:
-        name = ENDS[matcher.object][0]
-        tables += [score_answer(matcher.find(t.read(), name), t).assign(by="name") for t in targets]
+    answers = measured.ask_photographs(matcher, sources, targets=targets, progress=False)
+    tables = [measured.score_answer(answer, photograph).assign(by="picture") for photograph, answer in answers]
+    tables += [table.assign(by="name") for table in measured.ask_by_name(matcher, targets)]
     return pd.concat(tables, ignore_index=True)
 
 
@@ -386,13 +348,12 @@ def summarise_change(found: Sequence[dict[int, Found]]) -> dict[str, Any]:
     stops = [choose_stop([other for other in found if other is not part]) for part in found]
     before = pd.concat([part[0].rows for part in found], ignore_index=True)
     after = pd.concat([part[stop].rows for part, stop in zip(found, stops, strict=True)], ignore_index=True)
-    change = after.assign(**{name: after[name] - before[name] for name in MEASURES})
-    summary = {}
+    change = after.assign(**{name: after[name] - before[name] for name in measured.MEASURES})
+    summary, keys, tables = {}, (*measured.MEASURES, "queries", "intervals"), {"before": before, "after": after}
     for by in before["by"].unique():
-        tables = {"before": before, "after": after}
-        rows = {name: summarise_photographs(table[table["by"] == by]) for name, table in tables.items()}
-        kept = {name: {key: row[key] for key in (*MEASURES, "queries", "intervals")} for name, row in rows.items()}
-        summary[str(by)] = {**kept, "change": estimate_intervals(change[change["by"] == by])}
+        rows = {name: measured.summarise_photographs(table[table["by"] == by]) for name, table in tables.items()}
+        kept = {name: {key: row[key] for key in keys} for name, row in rows.items()}
+        summary[str(by)] = {**kept, "change": measured.estimate_intervals(change[change["by"] == by])}
     return summary
 
 
@@ -408,10 +369,9 @@ def make_card(name: str, told: dict[str, Any]) -> str:
     lines.append(f"| renders of the sample: RMSE | {before:.1f} px | {after:.1f} px | {after / before - 1:+.0%} |")
     limits = MEASURED.format(folds=told["folds"]) if told["found"] else NOT_MEASURED
     limits = limits if told["steps"] else f"{UNCHANGED}\n{limits}"
-    known = {**told, "source": told["asked"]["source"], "seed": told["asked"]["seed"], "steps": told["asked"]["steps"]}
-    known |= {"name": name, "rows": "\n".join(lines), "limits": limits, "taken": told["steps"],
-              "minutes": told["seconds"] / 60}  # fmt: skip
-    return CARD.format(**known)
+    known = {"name": name, "rows": "\n".join(lines), "limits": limits, "minutes": told["seconds"] / 60}
+    known |= {"taken": told["steps"], "steps": told["asked"]["steps"]}
+    return CARD.format(**told["asked"] | told | known)
 
 
 def _format_share(value: float, interval: Sequence[float] | None, form: str = ".0f") -> str:

@@ -20,6 +20,7 @@ from mmgsd.learn.compositing import composite, disturb
 from mmgsd.model.network import compute_input_size
 
 CACHE_SCALE = 1.25  # images are kept in memory at this multiple of the network's input size
+SHIFT = 0.06  # of an image's size, by which it is moved at most
 WAVES = 4  # that bend an image
 BEND_ITERATIONS = 12
 
@@ -52,7 +53,7 @@ class Batch:
 class Warp:
     """A smooth map of the image plane, in full-image px: an affine one, then gentle waves that bend it.
 
-    Built from where a pixel of the new image comes from, ``find_source``; ``move`` is the inverse.
+    Built from where a pixel of the new image comes from, ``find_grid_source``; ``move`` is the inverse.
     """
 
     affine: np.ndarray  # (2, 3)
@@ -60,13 +61,8 @@ class Warp:
     wave_vectors: np.ndarray  # (K, 2) rad/px
     phases: np.ndarray  # (K,) rad
 
-    def find_source(self, xy: np.ndarray) -> np.ndarray:
-        """Old px of new px (..., 2)."""
-        inverse = np.linalg.inv(self.affine[:, :2])
-        return (xy + self._bend(xy) - self.affine[:, 2]) @ inverse.T
-
     def find_grid_source(self, columns: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """`find_source` of every pixel of a grid, (rows, columns, 2): the sine of a sum by the sines of its parts."""
+        """Old px of every new px of a grid, (rows, columns, 2): the sine of a sum by the sines of its parts."""
         across = columns[:, None] * self.wave_vectors[:, 0]  # (columns, K)
         down = rows[:, None] * self.wave_vectors[:, 1] + self.phases  # (rows, K)
         parts = np.concatenate([np.cos(down), np.sin(down)], axis=1)  # (rows, 2 K)
@@ -80,27 +76,19 @@ class Warp:
         straight = xy @ self.affine[:, :2].T + self.affine[:, 2]
         moved = straight
         for _ in range(BEND_ITERATIONS):  # a contraction: the waves' slopes sum to 0.5 at most
-            moved = straight - self._bend(moved)
+            moved = straight - np.sin(moved @ self.wave_vectors.T + self.phases) @ self.amplitudes
         return moved
-
-    def mirrored(self, width: int) -> Warp:
-        """The same after the old image was mirrored, columns backwards."""
-        return dataclasses.replace(self, affine=self.affine @ [[-1, 0, width - 1], [0, 1, 0], [0, 0, 1]])
-
-    def _bend(self, xy: np.ndarray) -> np.ndarray:
-        return np.sin(xy @ self.wave_vectors.T + self.phases) @ self.amplitudes
 
 
 UNCHANGED = Warp(np.eye(2, 3), np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
 
 
 def sample_warp(
-    size: tuple[int, int], rng: np.random.Generator, *,
-    rotate: bool = True, scale: float = 0.2, shift: float = 0.06, bend: float = 0.0,
-) -> Warp:  # fmt: skip
+    size: tuple[int, int], rng: np.random.Generator, *, rotate: bool = True, scale: float = 0.2, bend: float = 0.0
+) -> Warp:
     """A random similarity of the image plane about the image's centre, bent by ``WAVES`` random waves.
 
-    Angle uniform over the circle (0 without ``rotate``), size times exp(± ``scale``), moved by up to ``shift`` of the
+    Angle uniform over the circle (0 without ``rotate``), size times exp(± ``scale``), moved by up to `SHIFT` of the
     image's size; the waves are half to a whole image long and stretch or squeeze by up to ``bend`` in all.
     """
     width, height = size
@@ -109,7 +97,7 @@ def sample_warp(
     cosine, sine = zoom * np.cos(angle), zoom * np.sin(angle)
     linear = np.array([[cosine, -sine], [sine, cosine]])
     centre = np.array([(width - 1) / 2, (height - 1) / 2])
-    move = rng.uniform(-shift, shift, 2) * (width, height)
+    move = rng.uniform(-SHIFT, SHIFT, 2) * (width, height)
     affine = np.column_stack([linear, centre - linear @ centre + move])
     direction, towards = rng.uniform(0, 2 * np.pi, (2, WAVES))
     number = rng.uniform(1, 2, WAVES) * 2 * np.pi / max(size)  # rad/px
@@ -152,9 +140,8 @@ def jitter_colours(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return image
 
 
-def load_training_images(data: Dataset, input_px: int, *, indices: np.ndarray | None = None) -> TrainingImages:
+def load_training_images(data: Dataset, input_px: int) -> TrainingImages:
     """Read images and masks once, reduced to a little more than the network's input size."""
-    indices = np.arange(len(data)) if indices is None else indices
     width, height = (round(s * CACHE_SCALE) for s in compute_input_size(data.size, input_px))
 
     def load(index: int) -> tuple[np.ndarray, np.ndarray]:
@@ -163,9 +150,8 @@ def load_training_images(data: Dataset, input_px: int, *, indices: np.ndarray | 
         return tuple(cv2.resize(a, (width, height), interpolation=cv2.INTER_AREA) for a in (image, mask))
 
     with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
-        images, masks = zip(*pool.map(load, indices), strict=True)
-    labels = data.xy[indices], data.visible[indices]
-    return TrainingImages(list(images), list(masks), *labels, data.size, data.mirror, data.present[indices])
+        images, masks = map(list, zip(*pool.map(load, range(len(data))), strict=True))
+    return TrainingImages(images, masks, data.xy, data.visible, data.size, data.mirror, data.present)
 
 
 def make_batch(
@@ -184,17 +170,15 @@ def make_batch(
     return Batch(image, *tensors)
 
 
-Labelled = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, bool]  # image, mask, xy, visible, present
-
-
-def _make_one(images: TrainingImages, index: int, config: TrainConfig, rng: np.random.Generator) -> Labelled:
+def _make_one(images: TrainingImages, index: int, config: TrainConfig, rng: np.random.Generator) -> tuple:
     """One augmented image (h, w, 3) uint8, its mask (h, w) bool, points (P, 2) px, which are visible, and presence."""
     size, warp, xy = compute_input_size(images.size, config.input_px), UNCHANGED, images.xy[index]
     visible, present = images.visible[index], images.present is None or bool(images.present[index])
     if config.augment:
         warp = sample_warp(images.size, rng, rotate=config.rotate, bend=config.bend)
         if images.mirror is not None and rng.random() < 0.5:
-            warp = warp.mirrored(images.size[0])
+            mirror = [[-1, 0, images.size[0] - 1], [0, 1, 0], [0, 0, 1]]  # columns backwards
+            warp = dataclasses.replace(warp, affine=warp.affine @ mirror)
             xy, visible = xy[images.mirror], visible[images.mirror]
     image, mask = warp_images([images.images[index], images.masks[index]], warp, images.size, size)
     xy = warp.move(xy)
@@ -207,7 +191,6 @@ def _make_one(images: TrainingImages, index: int, config: TrainConfig, rng: np.r
 
 
 def _borrow(images: TrainingImages, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Another image with its mask."""
     index = int(rng.integers(len(images.images)))
     return images.images[index], images.masks[index]
 

@@ -19,6 +19,7 @@ REMOVED = 0.05  # share that lose their object: there is nothing to be found
 COVERED = 0.3  # share with things in front of the object
 THINGS = 5  # fewer than so many lie behind the object
 BORROWED = 0.5  # share of the new backgrounds that come from other training images
+CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])  # of a square
 NATURAL, FLAT = 0.35, 0.2  # of the procedural ones: noise of all scales, and one colour
 
 
@@ -102,9 +103,6 @@ def fill_object(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
     return np.where(inside, filled.clip(0, 255).astype(np.uint8), image)
 
 
-# Backgrounds. -------------------------------------------------------------------------------------------------------
-
-
 def _draw_ground(
     shape: tuple[int, int], borrow: Callable[[], tuple[np.ndarray, np.ndarray]], rng: np.random.Generator
 ) -> np.ndarray:
@@ -168,9 +166,6 @@ def _draw_pattern(shape: tuple[int, int], rng: np.random.Generator) -> np.ndarra
     return 255 * (stripes ^ second if kind < 0.7 else stripes & second).astype(np.uint8)
 
 
-# Things. ------------------------------------------------------------------------------------------------------------
-
-
 def _draw_shape(shape: tuple[int, int], rng: np.random.Generator, size: tuple[float, float]) -> np.ndarray:
     """A convex thing, (h, w) uint8, 255 inside: two thirds quadrilaterals, else ellipses and long bars."""
     canvas, whole = np.zeros(shape, np.uint8), max(shape)
@@ -179,15 +174,14 @@ def _draw_shape(shape: tuple[int, int], rng: np.random.Generator, size: tuple[fl
     kind, angle = rng.random(), 0.0 if rng.random() < 0.4 else rng.uniform(0, np.pi)
     if kind < 0.65:
         sides[1] = sides[0] if rng.random() < 0.4 else sides[1]
-        corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * sides / 2
+        corners = CORNERS * sides / 2
         corners = corners * (1 + rng.uniform(-0.12, 0.12, (4, 2)) * (rng.random() < 0.4))
     elif kind < 0.82:
         turn = np.linspace(0, 2 * np.pi, 40)[:-1]
         sides[1] = sides[0] if rng.random() < 0.6 else sides[1]
         corners = np.stack([np.cos(turn), np.sin(turn)], -1) * sides / 2
     else:
-        corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * (whole * rng.uniform(0.3, 1.2),
-                                                                      whole * rng.uniform(0.01, 0.08)) / 2  # fmt: skip
+        corners = CORNERS * (whole * rng.uniform(0.3, 1.2), whole * rng.uniform(0.01, 0.08)) / 2
     c, s = np.cos(angle), np.sin(angle)
     places = corners @ np.array([[c, s], [-s, c]]) + middle
     cv2.fillConvexPoly(canvas, np.rint(places * 8).astype(np.int32), 255, cv2.LINE_8, 3)
@@ -212,9 +206,6 @@ def _paste(ground: np.ndarray, image: np.ndarray, mask: np.ndarray, rng: np.rand
     _cast_shadow(ground, mask, rng)
     share = cv2.merge([mask] * 3)
     return cv2.add(cv2.multiply(image, share, scale=1 / 255), cv2.multiply(ground, 255 - share, scale=1 / 255))
-
-
-# The camera. --------------------------------------------------------------------------------------------------------
 
 
 def _darken_corners(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:

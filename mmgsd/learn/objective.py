@@ -9,18 +9,12 @@ from torch.nn import functional as F
 from mmgsd.config import CONTRASTIVE, TrainConfig
 from mmgsd.learn import losses
 from mmgsd.learn.augmentation import Batch
-from mmgsd.model.heads import (
-    ELSEWHERE,
-    JITTER_PX,
-    SHARES,
-    Heads,
-    Outputs,
-    compute_mask_loss,
-    compute_presence_loss,
-    compute_visibility_loss,
-)
+from mmgsd.model.heads import Heads, Outputs
 from mmgsd.model.network import compute_cell_centres, compute_squared_distances, sample_descriptors
 
+SHARES = {"mask": 1.0, "visibility": 0.5, "presence": 0.2}  # of the heads' losses
+JITTER_PX = 6.0  # std by which true matches are moved before their visibility is learnt: modes are never exact
+ELSEWHERE = 2  # further places a query that are no match, and so not seen there
 VISIBILITY_POINTS = 24  # source points of each image that are looked for in another
 
 
@@ -56,8 +50,8 @@ def compute_loss(
         there = sampled[pair[1][:, None, None], orbit, -config.descriptor_dim :]  # (K, Q, G, D)
         match = (source[:, :, None] - there).square().sum(-1)
         distance2, is_non_match = _sample_non_matches(config, target, batch, pair, source, modes, size, generator)
-        function = losses.pcl if config.method == "pcl" else losses.spcl
-        return function((match + 1e-12).sqrt(), valid, (distance2 + 1e-12).sqrt(), is_non_match, margin=config.margin)
+        distances = (match + 1e-12).sqrt(), valid, (distance2 + 1e-12).sqrt(), is_non_match
+        return losses.pcl(*distances, margin=config.margin)
     return _compute_mixture_loss(source, target[pair[1]], modes, valid, size, compute_sigma(config, step))
 
 
@@ -97,12 +91,10 @@ def compute_head_loss(
     Every image's points are looked for in the next image of the batch, at their true matches, moved a little, and at
     random places. The descriptors are given to the visibility head as they are: its gradients do not reach them.
     """
-    losses = {
-        "mask": compute_mask_loss(outputs.mask, batch.mask.float()),
-        "presence": compute_presence_loss(outputs.presence, batch.mask.flatten(1).any(1) | batch.inside.any(1)),
-        "visibility": _compute_visibility_loss(heads, outputs, batch, permutations, size, generator),
-    }
-    return sum(SHARES[name] * loss for name, loss in losses.items())
+    mask = losses.compute_mask_loss(outputs.mask, batch.mask.float())
+    presence = losses.compute_presence_loss(outputs.presence, batch.mask.flatten(1).any(1) | batch.inside.any(1))
+    visibility = _compute_visibility_loss(heads, outputs, batch, permutations, size, generator)
+    return SHARES["mask"] * mask + SHARES["presence"] * presence + SHARES["visibility"] * visibility
 
 
 def _compute_visibility_loss(
@@ -124,7 +116,7 @@ def _compute_visibility_loss(
     there = sample_descriptors(there, places.flatten(1, 2), size).view(*places.shape[:3], -1)
     channels = outputs.descriptors.shape[1]
     logits = heads.visibility(source[:, :, None], there[..., :channels], there[..., channels:])
-    return compute_visibility_loss(logits, seen, valid & known[..., None])
+    return losses.compute_visibility_loss(logits, seen, valid & known[..., None])
 
 
 def _draw_places(modes: Tensor, size: tuple[int, int], generator: torch.Generator) -> Tensor:

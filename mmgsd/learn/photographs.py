@@ -32,13 +32,6 @@ OFF_OBJECT = 0.05  # probability that a mark lies on the object, below which it 
 NOWHERE = -1e5  # px: of points that a photograph does not show
 
 
-def check_photographs(photographs: Sequence[Photograph], kind: str) -> None:
-    """ValueError where there are too few to learn anything from that holds in another."""
-    if len(photographs) < 2:
-        raise ValueError(f"folder must hold at least two photographs of kind {kind!r}, got {len(photographs)}: nothing "
-                         "that is learnt from a single one need hold in another")  # fmt: skip
-
-
 def prepare_photographs(
     photographs: Sequence[Photograph], matcher: Matcher, group: SymmetryGroup
 ) -> tuple[TrainingImages, np.ndarray]:
@@ -47,8 +40,10 @@ def prepare_photographs(
     ValueError, which names the file, for one that cannot be read, has marks outside it or off the object, or more of
     them than look alike; and where nothing can be learnt from any.
     """
-    blocks = 1 + SURE * len(photographs)
-    permutations = np.concatenate([group.permutations, *(_turn(group, block) for block in range(blocks))], axis=1)
+    turns = np.arange(group.order)
+    circle = group.n_points + (turns[:, None] + turns) % group.order  # (G, G) the group on the first added block
+    added = [circle + group.order * block for block in range(1 + SURE * len(photographs))]
+    permutations = np.concatenate([group.permutations, *added], axis=1)
     xy = np.full((len(photographs), permutations.shape[1], 2), NOWHERE)
     visible, images, masks = np.zeros(xy.shape[:2], bool), [], []
     for number, photograph in enumerate(photographs):
@@ -88,12 +83,6 @@ def join_batches(batches: Sequence[Batch]) -> Batch:
     """One batch of all images; ValueError where their sizes or numbers of points differ."""
     fields = [field.name for field in dataclasses.fields(Batch)]
     return Batch(*(torch.cat([getattr(batch, name) for batch in batches]) for name in fields))
-
-
-def _turn(group: SymmetryGroup, block: int) -> np.ndarray:
-    """(G, G) the group on an added block of points."""
-    turns = np.arange(group.order)
-    return group.n_points + block * group.order + (turns[:, None] + turns) % group.order
 
 
 def _number_marks(photograph: Photograph, group: SymmetryGroup, kind: str) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The one training loop for all methods."""
+"""The one training loop for all methods, and its optimisers: AdamW, and Muon for the weights of convolutions."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torch.utils import deterministic
 
 from mmgsd.checks import read_count, read_flag
 from mmgsd.config import CONTRASTIVE, DETAILED, MATCHES_OF_ONE, PASSES, TrainConfig
 from mmgsd.dataset import Dataset, hold_out, join_datasets, load_parts
-from mmgsd.files import DamagedFileError, quarantine, saying_what_stays, write_text
+from mmgsd.files import is_kept, saying_what_stays, write_text
 from mmgsd.learn import distributed
 from mmgsd.learn.augmentation import Batch, load_training_images, make_batch
 from mmgsd.learn.checkpoints import (
@@ -33,9 +33,8 @@ from mmgsd.learn.checkpoints import (
     training_lock,
     write_checkpoint,
 )
+from mmgsd.learn.losses import compute_prototype_loss, make_prototypes
 from mmgsd.learn.objective import compute_head_loss, compute_loss
-from mmgsd.learn.optimiser import make_optimisers
-from mmgsd.learn.prototypes import compute_prototype_loss, make_prototypes
 from mmgsd.match.matcher import Matcher, load
 from mmgsd.measure.calibration import calibrate_bandwidth, calibrate_modes, calibrate_temperature, describe_places
 from mmgsd.measure.questions import measure_rmse
@@ -55,7 +54,56 @@ def compute_learning_rate(config: TrainConfig, step: int) -> float:
         return config.learning_rate * 0.9 ** (step // 250)
     warm_up = max(1, config.steps // 20)
     progress = (step - warm_up) / max(1, config.steps - warm_up)
-    return config.learning_rate * (min(1.0, (step + 1) / warm_up) * (0.01 + 0.99 * _cosine(max(0.0, progress))))
+    cosine = 0.5 * (1 + math.cos(math.pi * min(1.0, max(0.0, progress))))
+    return config.learning_rate * (min(1.0, (step + 1) / warm_up) * (0.01 + 0.99 * cosine))
+
+
+class ConvolutionMuon(torch.optim.Muon):
+    """torch's Muon (Jordan 2024), which takes matrices, for convolutions: each weight as (outputs, all else).
+
+    Its steps are as long as AdamW's at the same learning rate (Liu et al., arXiv 2502.16982).
+    """
+
+    def __init__(self, weights: list[nn.Parameter], *, lr: float, weight_decay: float) -> None:
+        self.weights = weights
+        matrices = [nn.Parameter(_view_as_matrix(weight.detach())) for weight in weights]
+        for weight, matrix in zip(weights, matrices, strict=True):
+            if weight.data_ptr() != matrix.data_ptr():
+                raise ValueError(f"weights must lie in memory channels last, got strides {weight.stride()}")
+        super().__init__(matrices, lr=lr, weight_decay=weight_decay, adjust_lr_fn="match_rms_adamw")
+
+    def step(self) -> None:
+        """Step with the convolutions' gradients."""
+        for weight, matrix in zip(self.weights, self.param_groups[0]["params"], strict=True):
+            matrix.grad = None if weight.grad is None else _view_as_matrix(weight.grad)
+        super().step()
+
+    def zero_grad(self, set_to_none: bool = True) -> None:
+        """Clear the convolutions' gradients too."""
+        super().zero_grad(set_to_none)
+        for weight in self.weights:
+            weight.grad = None
+
+
+def make_optimisers(network: nn.Module, others: list[nn.Parameter], config: TrainConfig) -> list[torch.optim.Optimizer]:
+    """Optimisers that together step every trained parameter of ``network`` and ``others``.
+
+    With ``config.optimiser`` "muon" the first is Muon, of the convolutions that neither work channel by channel nor
+    make the descriptors themselves; AdamW has the rest, or everything.
+    """
+    settings = {"lr": config.learning_rate, "weight_decay": config.weight_decay}
+    trained = [p for p in network.parameters() if p.requires_grad]
+    if config.optimiser == "adamw":
+        return [torch.optim.AdamW([*trained, *others], fused=True, **settings)]
+    last = {m.weight for m in network.head.modules() if isinstance(m, nn.Conv2d) and m.kernel_size == (1, 1)}
+    dense = {m.weight for m in network.modules() if isinstance(m, nn.Conv2d) and m.groups == 1} - last
+    weights, rest = [p for p in trained if p in dense], [p for p in trained if p not in dense]
+    return [ConvolutionMuon(weights, **settings), torch.optim.AdamW([*rest, *others], fused=True, **settings)]
+
+
+def _view_as_matrix(weight: Tensor) -> Tensor:
+    """(outputs, inputs, h, w) as (outputs, h * w * inputs): a view of what lies channels last."""
+    return weight.permute(0, 2, 3, 1).flatten(1)
 
 
 @own_numerics(gradients=True)
@@ -121,34 +169,31 @@ class Run:
         self.config, self.folder, self.world, self.validate_every = config, folder, world, validate_every
         # the latter for calibration
         self.data, self.held_out = (join_datasets(*split) for split in zip(*map(hold_out, parts), strict=True))
-        data = self.data
-        check_enough(data, self.held_out)
-        self.device, self.size = world.device, data.size
-        device = world.device
-        group = data.group(config.group)
-        known = group.permutations[:1] if config.method in MATCHES_OF_ONE else group.permutations
-        self.permutations = torch.tensor(known, device=device)
+        check_enough(self.data, self.held_out)
+        self.device, self.size = world.device, self.data.size
+        known = self.data.group(config.group).permutations
+        known = known[:1] if config.method in MATCHES_OF_ONE else known
+        self.permutations = torch.tensor(known, device=self.device)
         self.images = load_training_images(self.data, config.input_px)
         torch.manual_seed(config.seed)
-        network, places = _make_network(config, folder.parent)
-        start = places  # as the descriptors that the training goes on with lie
-        if start is None or start.shape != (data.n_points, config.descriptor_dim):
-            start = make_prototypes(self.data.xy, known, config.descriptor_dim, math.hypot(*data.size))
-        self.start(network, start, span=config.steps / 50)
+        network, prototypes = _make_network(config, folder.parent)
+        if prototypes is None or prototypes.shape != (self.data.n_points, config.descriptor_dim):
+            prototypes = make_prototypes(self.data.xy, known, config.descriptor_dim, math.hypot(*self.size))
+        self.start(network, prototypes, span=config.steps / 50)
 
-    def start(self, network: torch.nn.Module, prototypes: Tensor, *, span: float) -> None:
+    def start(self, network: nn.Module, prototypes: Tensor, *, span: float) -> None:
         """Before the first step; ``config``, ``folder``, ``world`` and ``device`` are set. ``span`` of the average."""
         self.network = network.to(self.device, memory_format=torch.channels_last)
         # the average of the last steps' weights, statistics of batch normalisation included, is what is kept
         average = get_ema_multi_avg_fn(1 - 1 / max(2.0, span))
         self.average = AveragedModel(self.network, multi_avg_fn=average, use_buffers=True)
-        self.prototypes = torch.nn.Parameter(prototypes.to(self.device))
+        self.prototypes = nn.Parameter(prototypes.to(self.device))
         self.trained = [p for p in self.network.parameters() if p.requires_grad]
         self.optimisers = make_optimisers(self.network, [self.prototypes], self.config)
         self.step, self.seconds, self.saved_at, self.saved_step, self.log = 0, 0.0, 0.0, 0, []
 
     def advance(self) -> float:
-        """One optimiser step; saves a checkpoint every ``CHECKPOINT_SECONDS``."""
+        """One optimiser step, after which the run is validated and saved where it is time."""
         start = time.perf_counter()
         self.network.train(not self.frozen_statistics)
         for optimiser in self.optimisers:
@@ -156,7 +201,7 @@ class Run:
             optimiser.zero_grad(set_to_none=True)
         loss = self.world.add(sum(self.learn(group) for group in self.world.batch_parts))
         self.world.share_gradients([*self.trained, self.prototypes])
-        torch.nn.utils.clip_grad_norm_(self.trained, 5.0)
+        nn.utils.clip_grad_norm_(self.trained, 5.0)
         for optimiser in self.optimisers:
             optimiser.step()
         self.average.update_parameters(self.network)
@@ -164,7 +209,10 @@ class Run:
         self.seconds += time.perf_counter() - start
         self.log.append({"step": self.step, "loss": loss, "seconds": round(self.seconds, 2)})
         if self.world.rank == 0:
-            self.keep()
+            if self.validate_every and self.step % self.validate_every == 0:
+                self.log[-1]["rmse_px"] = round(measure_rmse(self.make_matcher(), self.held_out), 2)
+            if self.seconds - self.saved_at >= CHECKPOINT_SECONDS:
+                self.save()
         return loss
 
     def learn(self, group: int) -> float:
@@ -183,13 +231,6 @@ class Run:
         (loss / groups).backward()
         return loss.item() / groups
 
-    def keep(self) -> None:
-        """Validate and save a checkpoint where it is time."""
-        if self.validate_every and self.step % self.validate_every == 0:
-            self.log[-1]["rmse_px"] = round(self.validate(), 2)
-        if self.seconds - self.saved_at >= CHECKPOINT_SECONDS:
-            self.save()
-
     def compute_dense_loss(self, descriptors: Tensor, batch: Batch) -> Tensor:
         """The prototypes' loss, on a part of the material points in turn."""
         turn = torch.arange(batch.askable.shape[1], device=self.device) % PROTOTYPE_EVERY
@@ -205,13 +246,11 @@ class Run:
             calibrate_bandwidth(matcher, self.held_out)
         return matcher
 
-    def validate(self) -> float:
-        """RMSE (px) on the held-out simulations."""
-        return measure_rmse(self.make_matcher(), self.held_out)
-
     def save(self) -> None:
         """Write a checkpoint whole or not at all."""
-        tensors = {"prototypes": self.prototypes.detach(), **self._list_weights()}
+        tensors = {"prototypes": self.prototypes.detach()}
+        for part in ("network", "average"):
+            tensors |= {f"{part}/{name}": value for name, value in getattr(self, part).state_dict().items()}
         for number, optimiser in enumerate(self.optimisers):
             for index, values in optimiser.state_dict()["state"].items():
                 tensors |= {f"optimisers/{number}/{index}/{name}": value for name, value in values.items()}
@@ -224,32 +263,16 @@ class Run:
         kept = f"its checkpoint of step {self.saved_step} is kept in {self.folder}: call again without overwrite"
         return f"training was stopped after step {self.step}; {kept if self.saved_step else 'nothing is kept yet'}"
 
-    def _list_weights(self) -> dict[str, Tensor]:
-        parts = {part: getattr(self, part).state_dict() for part in ("network", "average")}
-        return {f"{part}/{name}": value for part, values in parts.items() for name, value in values.items()}
-
-    def _read_checkpoint(self) -> tuple[dict[str, Tensor], dict[str, str]] | None:
-        """The folder's checkpoint, if there is one; the first process sets a damaged one aside before any goes on."""
-        path, found = self.folder / CHECKPOINT, None
-        like = {"prototypes": self.prototypes, **self._list_weights()}
-        if self.world.rank == 0 and path.is_file():
-            try:
-                found = read_checkpoint(path, like, str(self.device))
-            except DamagedFileError:
-                quarantine(path)
-        self.world.wait()
-        if self.world.rank and path.is_file():
-            found = read_checkpoint(path, like, str(self.device))
-        return found
-
     def resume(self) -> None:
         """Go on from the folder's checkpoint, if there is one; ValueError where it is of another configuration."""
-        found = self._read_checkpoint()
-        if found is None:
+        path = self.folder / CHECKPOINT
+        if self.world.rank == 0:  # sets a damaged one aside before any process goes on
+            is_kept(path, lambda file: read_checkpoint(file, str(self.device)))
+        self.world.wait()
+        if not path.is_file():
             return
-        tensors, metadata = found
+        tensors, metadata = read_checkpoint(path, str(self.device))
         if metadata["config"] != self._describe_config():
-            path = self.folder / CHECKPOINT
             raise ValueError(f"{path} belongs to another configuration: choose another folder or overwrite=True")
         self.prototypes.data.copy_(tensors.pop("prototypes"))
         parts = {"network": {}, "average": {}, "optimisers": {}}
@@ -326,7 +349,7 @@ def check_start(config: TrainConfig, models: Path) -> None:
     _make_network(config, models)
 
 
-def _make_network(config: TrainConfig, models: Path) -> tuple[torch.nn.Module, Tensor | None]:
+def _make_network(config: TrainConfig, models: Path) -> tuple[nn.Module, Tensor | None]:
     """The network as training starts from it, and the object's places if the weights it goes on from know them.
 
     ``models`` is the folder of the models trained beside it.
@@ -345,7 +368,3 @@ def _make_network(config: TrainConfig, models: Path) -> tuple[torch.nn.Module, T
         network.start_from(trained.network)
         places = trained.places
     return network, places
-
-
-def _cosine(progress: float) -> float:
-    return 0.5 * (1 + math.cos(math.pi * min(1.0, progress)))

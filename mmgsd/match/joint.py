@@ -12,8 +12,6 @@ apart to one: that tells which end of a rope is which, as smoothness hardly does
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components, shortest_path
@@ -34,14 +32,6 @@ ROUNDS = 15  # of maps from assigned modes and modes assigned by maps
 STARTS, APART = 4, 5  # places from which assigning starts, each the fifth clearest; the most likely outcome counts
 BALANCE = 20  # normalisations of rows and columns in a round
 UNKNOWN = 1e4  # variance of what a place says that is not sure at all, by the squared extent
-
-
-@dataclass(frozen=True, eq=False)
-class Joined:
-    """Which mode of each of S places belongs to each of n maps, and how likely that is beside other outcomes."""
-
-    order: np.ndarray  # (S, n) index of the mode that each map has, a permutation a place
-    likelihood: float  # mean log-likelihood of a place's modes
 
 
 def spread_places(mask: np.ndarray, count: int = PLACES) -> np.ndarray:
@@ -73,7 +63,7 @@ def join(
     given = [np.arange(first, min(first + QUESTIONS, count)) for first in range(0, max(count, 1), QUESTIONS)]
     last, orders, common = np.arange(count, len(xy)), [], None
     for rows in (np.concatenate([part, last]) for part in given):
-        order = _join(*(values[rows] for values in (xy, modes, weights, spread)), mask).order
+        order = _join(*(values[rows] for values in (xy, modes, weights, spread)), mask)
         if common is None:
             heavy = np.take_along_axis(weights[rows], order, 1)[-places:].sum(0)  # of all, where there are no places
             order = order[:, np.argsort(-heavy, kind="stable")]
@@ -85,61 +75,53 @@ def join(
     return np.concatenate([*orders, common])
 
 
-def _join(xy: np.ndarray, modes: np.ndarray, weights: np.ndarray, spread: np.ndarray, mask: np.ndarray) -> Joined:
-    """The most likely of the outcomes that start at several pixels."""
+def _join(xy: np.ndarray, modes: np.ndarray, weights: np.ndarray, spread: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """The order (S, n) that is the most likely of the outcomes that start at several pixels."""
     count, n = weights.shape
     known = np.isfinite(modes).all(-1)
     if n < 2 or count < 3 or not known.all(1).any():
-        return Joined(np.tile(np.arange(n), (count, 1)), 0.0)
+        return np.tile(np.arange(n), (count, 1))
     middle = modes[known].mean(0)
     extent = max(float(np.sqrt(np.mean(np.sum((modes[known] - middle) ** 2, -1)))), 1e-6)
     values = np.where(known[..., None], (modes - middle) / extent, 0.0)
     variance = np.where(known, (np.nan_to_num(spread) / extent) ** 2 + NOISE**2, 4.0)
     log_weights = np.log(np.clip(np.nan_to_num(weights), 1e-3, None))
-    edges, length = _list_edges(xy, mask)
-    graph = _Graph(xy, edges, length)
-    rivals = _find_rivals(graph.measure_ways(), values, known)
-    found = [_assign(graph.kernel, rivals, values, variance, log_weights, start)
+    edges = _list_edges(xy, mask)
+    length = np.linalg.norm(xy[edges[:, 0]] - xy[edges[:, 1]], axis=1)
+    length = np.maximum(length, 1e-6) / max(float(np.sqrt(np.mean(np.sum((xy - xy.mean(0)) ** 2, -1)))), 1e-6)
+    kernel = _make_kernel(edges, length, count)
+    ways = shortest_path(coo_matrix((length, edges.T), shape=(count, count)), directed=False)  # by the extent
+    rivals = _find_rivals(ways, values, known)
+    found = [_assign(kernel, rivals, values, variance, log_weights, start)
              for start in _choose_starts(values, variance, known)]  # fmt: skip
-    return max(found, key=lambda joined: joined.likelihood)
+    return max(found, key=lambda outcome: outcome[1])[0]
 
 
-class _Graph:
-    """Places (S, 2), and how alike what lies there goes on: edges (E, 2) of some ``length`` (E,), by their extent."""
+def _make_kernel(edges: np.ndarray, length: np.ndarray, count: int) -> np.ndarray:
+    """(S, S) covariance of a map's values: Matérn's, with steps as long as those of places, and a constant.
 
-    def __init__(self, xy: np.ndarray, edges: np.ndarray, length: np.ndarray) -> None:
-        self.extent = max(float(np.sqrt(np.mean(np.sum((xy - xy.mean(0)) ** 2, -1)))), 1e-6)
-        self.edges, self.length, self.count = edges, np.maximum(length, 1e-6) / self.extent, len(xy)
-        self.kernel = self._make_kernel()
-
-    def _make_kernel(self) -> np.ndarray:
-        """(S, S) covariance of a map's values: Matérn's, with steps as long as those of places, and a constant."""
-        unit = float(np.median(self.length))
-        strength = 1 / np.maximum(self.length / unit, 0.25) ** 2
-        near = coo_matrix((strength, self.edges.T), shape=(self.count, self.count)).toarray()
-        near += near.T
-        values, vectors = np.linalg.eigh(np.diag(near.sum(0)) - near)
-        spectrum = (2 * SMOOTHNESS * (unit / RANGE) ** 2 + np.maximum(values, 0)) ** -SMOOTHNESS
-        kernel = (vectors * spectrum) @ vectors.T
-        (first, second), own = self.edges.T, np.diag(kernel)
-        step = np.mean(own[first] + own[second] - 2 * kernel[first, second])
-        return kernel * (STRETCH * np.mean(self.length**2) / 2 / step) + 1.0
-
-    def measure_ways(self) -> np.ndarray:
-        """(S, S) shortest ways over the object, by its extent."""
-        return shortest_path(coo_matrix((self.length, self.edges.T), shape=(self.count, self.count)), directed=False)
+    Of ``count`` places, of which ``edges`` (E, 2) of some ``length`` (E,), by the object's extent, join neighbours.
+    """
+    unit = float(np.median(length))
+    near = coo_matrix((1 / np.maximum(length / unit, 0.25) ** 2, edges.T), shape=(count, count)).toarray()
+    near += near.T
+    values, vectors = np.linalg.eigh(np.diag(near.sum(0)) - near)
+    spectrum = (2 * SMOOTHNESS * (unit / RANGE) ** 2 + np.maximum(values, 0)) ** -SMOOTHNESS
+    kernel = (vectors * spectrum) @ vectors.T
+    (first, second), own = edges.T, np.diag(kernel)
+    step = np.mean(own[first] + own[second] - 2 * kernel[first, second])
+    return kernel * (STRETCH * np.mean(length**2) / 2 / step) + 1.0
 
 
-def _list_edges(xy: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs (E, 2) of near places with the object between them, and their distances (E,); all places hang together."""
+def _list_edges(xy: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Pairs (E, 2) of near places with the object between them; all places hang together."""
     index = cKDTree(xy).query(xy, k=min(NEIGHBOURS + 1, len(xy)))[1]
     edges = np.stack([np.repeat(np.arange(len(xy)), index.shape[1]), index.ravel()], 1)
     edges = np.unique(np.sort(edges[edges[:, 0] != edges[:, 1]], 1), axis=0)
     share = np.linspace(0.2, 0.8, 4)[:, None, None]
     points = np.rint(xy[edges[:, 0]] * (1 - share) + xy[edges[:, 1]] * share).astype(int)  # (4, E, 2)
     column, row = (np.clip(points[..., k], 0, mask.shape[1 - k] - 1) for k in (0, 1))
-    edges = _connect(edges[mask[row, column].mean(0) >= BETWEEN], xy)
-    return edges, np.linalg.norm(xy[edges[:, 0]] - xy[edges[:, 1]], axis=1)
+    return _connect(edges[mask[row, column].mean(0) >= BETWEEN], xy)
 
 
 def _connect(edges: np.ndarray, xy: np.ndarray) -> np.ndarray:
@@ -174,8 +156,8 @@ def _choose_starts(values: np.ndarray, variance: np.ndarray, known: np.ndarray) 
 def _assign(
     kernel: np.ndarray, rivals: np.ndarray, values: np.ndarray, variance: np.ndarray, log_weights: np.ndarray,
     start: int,
-) -> Joined:  # fmt: skip
-    """Maps and assignments found from one place, whose modes are numbered as they come."""
+) -> tuple[np.ndarray, float]:  # fmt: skip
+    """The order (S, n) found from one place, whose modes are numbered as they come, and its mean log-likelihood."""
     count, n = variance.shape
     told = np.repeat(values.mean(1, keepdims=True), n, 1)  # (S, map, 2) where each place says that the maps take it
     noise = np.full((count, n), UNKNOWN)
@@ -194,7 +176,7 @@ def _assign(
         scatter = np.sum((values[:, :, None] - told[:, None]) ** 2, -1) / 2
         sure = (np.sum(share**2, 1) - 1 / n) / (1 - 1 / n)  # 0 where all modes fit alike
         noise = np.einsum("sag,sag->sg", share, variance[..., None] + scatter) / np.maximum(sure, 0.01) ** 2
-    return Joined(_round(share), float(np.mean(np.sum(share * np.clip(logits, -50, None), (1, 2)))))
+    return _round(share), float(np.mean(np.sum(share * np.clip(logits, -50, None), (1, 2))))
 
 
 def _predict(kernel: np.ndarray, told: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -17,13 +17,8 @@ from mmgsd.numerics import numpy_defaults
 
 RADIUS_PX = 20.0  # of a training image, within which a robot's grasp still holds, unless the caller says otherwise
 LIKELY = 0.5  # from here on something is said to be so
-SHARED = (
-    "image0",
-    "image1",
-    "scale",
-    "calibration",
-    "joint_weights",
-)  # fields of all queries; of others the first axis counts queries
+# fields of all queries; of others the first axis counts queries
+SHARED = ("image0", "image1", "scale", "calibration", "joint_weights")
 
 
 @dataclass(frozen=True)
@@ -220,12 +215,13 @@ class Match:
         """The answer to some queries alone; IndexError for one that there is not, or what is no index."""
         if isinstance(index, bool | np.bool_) or index is None:
             raise IndexError(f"index must be an integer, a slice, an array of indices or a mask, got {index!r}")
-        rows = np.atleast_1d(np.arange(len(self))[[] if np.size(index) == 0 and not _is_mask(index) else index])
+        nothing = np.size(index) == 0 and np.asarray(index).dtype != bool
+        rows = np.atleast_1d(np.arange(len(self))[[] if nothing else index])
         if rows.ndim > 1:
             raise IndexError(f"index must have one axis, got shape {np.shape(index)}")
-        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        per_query = {name: value for name, value in fields.items() if name not in SHARED and value is not None}
-        return dataclasses.replace(self, **{name: value[rows] for name, value in per_query.items()})
+        names = {field.name for field in dataclasses.fields(self)} - {*SHARED}
+        known = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        return dataclasses.replace(self, **{name: value[rows] for name, value in known.items()})
 
     def __repr__(self) -> str:
         sizes = (f"{image.shape[1]} x {image.shape[0]} px" for image in (self.image0, self.image1))
@@ -260,7 +256,3 @@ def _take_modes(match: Match, order: np.ndarray) -> dict[str, np.ndarray | None]
         "covariances": np.take_along_axis(match.covariances, order[..., None, None], 1),
         "visible": None if match.visible is None else np.take_along_axis(match.visible, order, 1),
     }
-
-
-def _is_mask(index: Any) -> bool:
-    return np.asarray(index).dtype == bool

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import math
-from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mmgsd.checks import read_flag, renamed
+from mmgsd.checks import check, read_flag, renamed
 from mmgsd.config import CONTRASTIVE, OBJECTS, TrainConfig
 from mmgsd.images import check_aspect, check_mask, check_pixels, to_rgb
 from mmgsd.match.joint import join, spread_places
@@ -100,12 +99,12 @@ class Matcher:
     @own_numerics(gradients=True)
     def load(cls, path: Path | str, *, device: str = "") -> Matcher:
         """Weights from a safetensors file; FileNotFoundError, or ValueError for one that is damaged or not ours."""
-        weights = read_weights(path)
+        network, config, settings, object = read_weights(path)
         try:
-            matcher = cls(weights.network, weights.config, device=device, **weights.settings)
+            matcher = cls(network, config, device=device, **settings)
         except ValueError as error:
             raise ValueError(f"{path}: of its metadata, {error}: get the file anew") from error
-        matcher.object = weights.object
+        matcher.object = object
         return matcher
 
     @own_numerics()
@@ -191,8 +190,7 @@ class Matcher:
 
     def segment(self, image: Any) -> np.ndarray:
         """Where an image shows the object: (H, W) float32 in [0, 1]; ValueError of weights that learnt no mask."""
-        image = to_rgb(image)
-        self.compute_input_size(image)
+        image, _ = take_image(self, image)
         mask = self.describe([image])[0].mask
         if mask is None:
             raise ValueError(f"these weights of {self.config.name} learnt no mask: load others, like 'cloth' or 'rope'")
@@ -255,11 +253,10 @@ class Matcher:
         """
         sampled = []
         for image, xy in pictures:
-            image = to_rgb(image)
+            image, _ = take_image(self, image)
             size = image.shape[1::-1]
-            self.compute_input_size(image)
-            points = check_pixels(xy, size, image="image")
-            sampled.append(self.sample_sources(self.describe([image])[0], torch.from_numpy(points), size)[0])
+            points = torch.from_numpy(check_pixels(xy, size, image="image"))
+            sampled.append(self.sample_sources(self.describe([image])[0], points, size)[0])
         if not sampled:
             raise ValueError("pictures must be (image, (x, y)), one or more, got none")
         return Place(torch.cat(sampled).mean(0, keepdim=True))
@@ -322,31 +319,19 @@ class Matcher:
         mask1: Any = None,
     ) -> Pair:  # fmt: skip
         if image0 is None:
-            return self._prepare_flat(image1, describe, mask0, mask1)
-        images = {name: to_rgb(image, name) for name, image in (("image0", image0), ("image1", image1))}
-        for name, image in images.items():
-            self.compute_input_size(image, name)
-        masks = {"mask0": mask0, "mask1": mask1}
-        for (name, mask), image in zip(masks.items(), images.values(), strict=True):
-            masks[name] = None if mask is None else check_mask(mask, image.shape[:2], name)
-        return Pair(self, *images.values(), tuple(describe(list(images.values()))), **masks)
-
-    def _prepare_flat(
-        self, image1: Any, describe: Callable[[list[np.ndarray]], list[Outputs]], mask0: Any, mask1: Any
-    ) -> Pair:
-        if mask0 is not None:
-            raise ValueError("mask0 must be None where there is no image0")
-        image = to_rgb(image1, "image1")
-        self.compute_input_size(image, "image1")
-        mask = None if mask1 is None else check_mask(mask1, image.shape[:2], "mask1")
-        return Pair(self, None, image, (None, *describe([image])), None, mask)
+            check("mask0", mask0, "None where there is no image0", mask0 is None)
+            image1, mask1 = take_image(self, image1, mask1, "image1", "mask1")
+            return Pair(self, None, image1, (None, *describe([image1])), None, mask1)
+        image0, mask0 = take_image(self, image0, mask0, "image0", "mask0")
+        image1, mask1 = take_image(self, image1, mask1, "image1", "mask1")
+        return Pair(self, image0, image1, tuple(describe([image0, image1])), mask0, mask1)
 
 
 class _Recent:
     """What ``describe`` said of the last few images, found again by their pixels: a camera may refill one array."""
 
     def __init__(self, describe: Callable[[list[np.ndarray]], list[Outputs]], *, kept: int = 8) -> None:
-        self._describe, self._kept, self._said = describe, kept, OrderedDict()
+        self._describe, self._kept, self._said = describe, kept, {}
 
     def describe(self, images: list[np.ndarray]) -> list[Outputs]:
         """As `Matcher.describe`."""
@@ -354,11 +339,9 @@ class _Recent:
 
     def _look_up(self, image: np.ndarray) -> Outputs:
         key = image.shape, hashlib.blake2b(image).digest()
-        if key not in self._said:
-            self._said[key] = self._describe([image])[0]
-        self._said.move_to_end(key)
-        while len(self._said) > self._kept:
-            self._said.popitem(last=False)
+        self._said[key] = self._said.pop(key) if key in self._said else self._describe([image])[0]
+        if len(self._said) > self._kept:
+            del self._said[next(iter(self._said))]
         return self._said[key]
 
 
@@ -382,7 +365,9 @@ class Pair:
         points = check_pixels(xy, self.image0.shape[1::-1])
         if not joint:
             return self._match(points, n)
-        count = check_answers(self.matcher.num_modes if n is None else n, self.matcher.num_modes)
+        most = self.matcher.num_modes
+        count = most if n is None else n
+        check_modes(count, "n", most, " with joint")
         match, order = self.match_everywhere(points)
         weights = np.take_along_axis(match.weights, order, 1)
         heavy = weights[len(points) if len(match) > len(points) else 0 :].sum(0) + 1e-9
@@ -439,6 +424,15 @@ class Pair:
         return known
 
 
+def take_image(
+    matcher: Matcher, image: Any, mask: Any = None, name: str = "image", mask_name: str = "mask"
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """An image (H, W, 3) uint8 that can be asked about, and its mask (H, W) bool; ValueError for another of either."""
+    image = to_rgb(image, name)
+    matcher.compute_input_size(image, name)
+    return image, None if mask is None else check_mask(mask, image.shape[:2], mask_name)
+
+
 def load(weights: Path | str, *, device: str = "") -> Matcher:
     """A `Matcher` with the weights of a file, or of a name of shipped ones: ``"cloth"``, ``"rope-spcl"``.
 
@@ -486,14 +480,6 @@ def make_match(
     return dataclasses.replace(match, entropy=match.entropy - np.float32(2 * math.log(scale)))
 
 
-def check_answers(n: Any, most: int) -> int:
-    """How many joint answers are wanted; ValueError for what is not a whole number from 1 to the ``most`` there are."""
-    whole = isinstance(n, int | np.integer) and not isinstance(n, bool)
-    if not whole or not 1 <= n <= most:
-        raise ValueError(f"n must be a whole number from 1 to {most} with joint, got {n!r:.80}")
-    return int(n)
-
-
 def compute_scale(size: tuple[int, int], trained: tuple[int, int]) -> float:
     """px of an image of ``size`` by px of one that the model was ``trained`` with: the root of their areas' ratio.
 
@@ -516,5 +502,5 @@ def _check_size(size: tuple[int, int]) -> None:
     """ValueError unless two whole numbers of px."""
     low, high = SIZES_PX
     whole = isinstance(size, tuple | list) and len(size) == 2 and all(type(side) is int for side in size)
-    if not whole or not all(low <= side <= high for side in size):
-        raise ValueError(f"size must be (width, height), two whole numbers of {low} to {high} px, got {size!r:.80}")
+    accepted = f"(width, height), two whole numbers of {low} to {high} px"
+    check("size", size, accepted, whole and all(low <= side <= high for side in size))

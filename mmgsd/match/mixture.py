@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from mmgsd.checks import check
 from mmgsd.config import MAX_MODES, ROUNDNESS
 from mmgsd.numerics import own_numerics
 
@@ -54,11 +55,9 @@ class ModeReadout:
     mean_exponent: float = 1.0
 
     def __post_init__(self) -> None:
-        if not 0 < self.shape_prior < math.inf:
-            raise ValueError(f"shape_prior must be greater than 0, got {self.shape_prior!r}")
+        check("shape_prior", self.shape_prior, "greater than 0", 0 < self.shape_prior < math.inf)
         for name in ("exponent", "mean_exponent"):
-            if not 1 <= getattr(self, name) < math.inf:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)!r}")
+            check(name, getattr(self, name), "at least 1", 1 <= getattr(self, name) < math.inf)
 
 
 AS_IT_IS = ModeReadout()  # modes at the means of their shares
@@ -76,26 +75,19 @@ class Mixture:
 
 @own_numerics()
 def fit_modes(
-    heatmap: Tensor,
-    n: int | str | Tensor,
-    xs: Tensor,
-    ys: Tensor,
-    *,
-    cycles: int = CYCLES,
-    readout: ModeReadout = AS_IT_IS,
+    heatmap: Tensor, n: int | str | Tensor, xs: Tensor, ys: Tensor, *, readout: ModeReadout = AS_IT_IS,
     merge: bool = False,
-) -> Mixture:
+) -> Mixture:  # fmt: skip
     """Fit an n-modal Gaussian mixture to each heatmap by weighted expectation-maximisation.
 
     ``heatmap`` (S, h, w) not negative, ``n`` modes for all or (S,), or "auto" for what the Bayesian information
     criterion prefers; ``xs`` (w,) and ``ys`` (h,) cell centres in px. Symmetric modes are a priori equally likely,
     round and equally wide, the latter two as far as ``readout`` says: that decides which cell belongs to which mode,
     while the result holds the moments of the mass itself. With ``merge``, modes less than a cell apart are one, and
-    the others absent. Raises ValueError for other shapes, ``n`` that is not from 1
-    to `MAX_MODES`, another word, or values that are not finite.
+    the others absent. Raises ValueError for ``n`` that is not from 1 to `MAX_MODES`, another word, or values that are
+    not finite.
     """
-    n, n_max = _check_fit(heatmap, n, xs, ys)
-    how = cycles, readout.shape_prior
+    count = check_count(n, "n", queries=len(heatmap))
     heatmap = heatmap.float()
     total = heatmap.flatten(1).sum(-1, keepdim=True)
     if not total.isfinite().all():
@@ -104,7 +96,11 @@ def fit_modes(
     grid = heatmap.shape[1:]
     mass = _interpolate(mass, grid)
     powered = _raise(mass, readout.exponent)
-    params = _choose_fit(powered, grid, *how) if n is None else _fit(powered, n, n_max, grid, *how)
+    if count is None:
+        params = _choose_fit(powered, grid, readout.shape_prior)
+    else:
+        most = int(count.max()) if count.numel() else 1
+        params = _fit(powered, count.to(heatmap.device).expand(len(heatmap)), most, grid, readout.shape_prior)
     params = _measure_shares(mass, params, grid, readout)
     params = _merge(params) if merge else params
     outlier_mass = _measure_outliers(mass, params, grid)
@@ -112,22 +108,18 @@ def fit_modes(
     params = params.gather(1, order[..., None].expand_as(params))
     absent = (params[..., 2] == 0)[..., None]
     step = torch.stack([xs[1] - xs[0], ys[1] - ys[0]])  # px a cell
-    modes = params[..., :2] * step + torch.stack([xs.mean(), ys.mean()])
-    a, b, c = params[..., 3:].unbind(-1)
-    covariances = torch.stack([torch.stack([a, b], -1), torch.stack([b, c], -1)], -2) * step[:, None] * step
-    nan = torch.nan
-    return Mixture(
-        modes.masked_fill(absent, nan), params[..., 2], covariances.masked_fill(absent[..., None], nan), outlier_mass
-    )
+    modes = (params[..., :2] * step + torch.stack([xs.mean(), ys.mean()])).masked_fill(absent, torch.nan)
+    covariances = params[..., [3, 4, 4, 5]].unflatten(-1, (2, 2)) * step[:, None] * step
+    return Mixture(modes, params[..., 2], covariances.masked_fill(absent[..., None], torch.nan), outlier_mass)
 
 
 # A fit's parameters are (S, N, 6): a component's mean x, y, weight and covariance [[a, b], [b, c]], in cells, from the
 # grid's centre, so that one regularisation suits every image size. Weight 0 marks a component that a query has not.
 
 
-def _fit(mass: Tensor, n: Tensor, n_max: int, grid: tuple[int, int], cycles: int, shape_prior: float) -> Tensor:
+def _fit(mass: Tensor, n: Tensor, n_max: int, grid: tuple[int, int], shape_prior: float) -> Tensor:
     """Parameters of the fit to (S, C) mass; where a component collapsed, the likelier of it and one from the peaks."""
-    how = n_max, grid, cycles, shape_prior
+    how = n_max, grid, shape_prior
     params = _fit_from(ANNEALING, mass, n, *how)
     weight = params[..., 2]
     poor = ((weight > 0) & (weight * n[:, None] < COLLAPSED)).any(1).nonzero()[:, 0]
@@ -140,9 +132,8 @@ def _fit(mass: Tensor, n: Tensor, n_max: int, grid: tuple[int, int], cycles: int
 
 
 def _fit_from(
-    temperatures: tuple[float, ...], mass: Tensor, n: Tensor, n_max: int, grid: tuple[int, int], cycles: int,
-    shape_prior: float,
-) -> Tensor:  # fmt: skip
+    temperatures: tuple[float, ...], mass: Tensor, n: Tensor, n_max: int, grid: tuple[int, int], shape_prior: float
+) -> Tensor:
     """Parameters of the fit to (S, C) mass, flattened before, in chunks of queries: memory stays bounded."""
     coarse, coarse_grid = _halve(mass, grid)
     size = _get_chunk(n_max, coarse)
@@ -151,7 +142,7 @@ def _fit_from(
     params = torch.cat(starts) * mass.new_tensor([2, 2, 1, 4, 4, 4])
     params[..., 0] += 0.5 * (grid[1] % 2)  # an odd grid was halved with a column, or a row, of nothing
     params[..., 1] += 0.5 * (grid[0] % 2)
-    return _run_em(mass, params, _describe_cells(grid, mass.device), cycles, shape_prior)
+    return _run_em(mass, params, _describe_cells(grid, mass.device), shape_prior)
 
 
 def _merge(params: Tensor) -> Tensor:
@@ -261,10 +252,10 @@ def _describe_cells(grid: tuple[int, int], device: torch.device) -> Tensor:
     return torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y])
 
 
-def _run_em(mass: Tensor, params: Tensor, cells: Tensor, cycles: int, shape_prior: float) -> Tensor:
+def _run_em(mass: Tensor, params: Tensor, cells: Tensor, shape_prior: float) -> Tensor:
     """Iterate until at rest; then the moments of each component's share of the mass, without the priors."""
     size, moving = _get_chunk(params.shape[1], mass), torch.arange(len(mass), device=mass.device)
-    for _ in range(cycles):
+    for _ in range(CYCLES):
         moved = []
         for part in moving.split(size):
             after = _run_cycle(mass[part], params[part], cells, shape_prior)
@@ -339,11 +330,11 @@ def _compute_log_likelihood(mass: Tensor, params: Tensor, cells: Tensor, *, even
     return torch.cat([(_compute_log_densities(s, cells).logsumexp(1).logaddexp(floor) * m).sum(-1) for m, s in parts])
 
 
-def _choose_fit(mass: Tensor, grid: tuple[int, int], cycles: int, shape_prior: float) -> Tensor:
+def _choose_fit(mass: Tensor, grid: tuple[int, int], shape_prior: float) -> Tensor:
     """State (S, 8, 6) with as many components as the Bayesian information criterion prefers."""
     cells, states, criteria = _describe_cells(grid, mass.device), [], []
     for n in range(1, MOST_MODES + 1):
-        params = _fit(mass, torch.full((len(mass),), n, device=mass.device), n, grid, cycles, shape_prior)
+        params = _fit(mass, torch.full((len(mass),), n, device=mass.device), n, grid, shape_prior)
         likelihood = SAMPLES * _compute_log_likelihood(mass, params, cells)
         criteria.append((6 * n - 1) * float(np.log(SAMPLES)) - 2 * likelihood)
         states.append(F.pad(params, (0, 0, 0, MOST_MODES - n)))
@@ -363,16 +354,6 @@ def _measure_outliers(mass: Tensor, params: Tensor, grid: tuple[int, int]) -> Te
     return (mass * outlier_mass).sum(-1)
 
 
-def _check_fit(heatmap: Tensor, n: int | str | Tensor, xs: Tensor, ys: Tensor) -> tuple[Tensor | None, int]:
-    """The number of modes (S,), or None where the data are to choose it, and the most that can be."""
-    if heatmap.ndim != 3 or heatmap.shape[1:] != (len(ys), len(xs)):
-        raise ValueError(f"heatmap must have shape (S, {len(ys)}, {len(xs)}), got {tuple(heatmap.shape)}")
-    n = check_count(n, "n", queries=len(heatmap))
-    if n is None:
-        return None, MOST_MODES
-    return n.to(heatmap.device).expand(len(heatmap)), int(n.max()) if n.numel() else 1
-
-
 def check_count(n: Any, name: str, *, queries: int = 1) -> Tensor | None:
     """Numbers of modes, () or (S,) for as many ``queries``, or None from "auto".
 
@@ -380,29 +361,22 @@ def check_count(n: Any, name: str, *, queries: int = 1) -> Tensor | None:
     """
     if isinstance(n, str) and n == "auto":
         return None
-    accepted = f"{name} must be an integer, or integers, from 1 to {MAX_MODES}, or 'auto'"
-    if isinstance(n, str):
-        raise ValueError(f"{accepted}, got {n!r:.80}")
+    accepted = f"{name} must be an integer, or ({queries},) integers, from 1 to {MAX_MODES}, or 'auto'"
     try:
         count = torch.as_tensor(n)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         raise ValueError(f"{accepted}, got {n!r:.80}") from error
-    if count.numel() and (count.is_floating_point() or count.is_complex() or count.dtype == torch.bool):
-        raise ValueError(f"{accepted}, got {count.dtype}: {n!r:.80}")
-    if count.ndim and count.shape != (queries,):
-        raise ValueError(f"{name} must be one number or of shape ({queries},), got shape {tuple(count.shape)}")
-    if count.numel() and int(count.min()) < 1:
-        raise ValueError(f"{name} must be at least 1, got {int(count.min())}")
-    if count.numel() and int(count.max()) > MAX_MODES:
-        raise ValueError(f"{name} must be at most {MAX_MODES}, got {int(count.max())}")
+    whole = not (count.is_floating_point() or count.is_complex() or count.dtype == torch.bool)
+    within = not count.numel() or (whole and bool(((count >= 1) & (count <= MAX_MODES)).all()))
+    if not within or count.shape not in ((), (queries,)):
+        raise ValueError(f"{accepted}, got {n!r:.80}")
     return count.long()
 
 
-def check_modes(modes: Any) -> None:
-    """ValueError for a model's number of modes that is not from 1 to `MAX_MODES`."""
+def check_modes(modes: Any, name: str = "modes", most: int = MAX_MODES, where: str = "") -> None:
+    """ValueError, which names it, for a number of modes that is no integer from 1 to the ``most`` there can be."""
     whole = isinstance(modes, int | np.integer) and not isinstance(modes, bool)
-    if not whole or not 1 <= modes <= MAX_MODES:
-        raise ValueError(f"modes must be an integer from 1 to {MAX_MODES}, got {modes!r}")
+    check(name, modes, f"an integer from 1 to {most}{where}", whole and 1 <= modes <= most)
 
 
 def keep_most_probable(fit: Mixture, n: Tensor) -> Mixture:

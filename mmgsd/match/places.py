@@ -50,16 +50,14 @@ class Flat:
         cloth's columns and rows, a number with a fraction along a rope. ValueError for anything else.
         """
         several = isinstance(places, list) or (isinstance(places, np.ndarray) and places.ndim > 1)
-        at = np.array([self._find(place) for place in (places if several else [places])]).reshape(
-            -1, 2
-        )  # columns, rows
+        at = np.array([self._find(place) for place in (places if several else [places])]).reshape(-1, 2)
         height, width = self.outputs.descriptors.shape[1:]
         cell = np.array([self.image.shape[1] / width, self.image.shape[0] / height])
+        xy = ((at + 0.5) * cell - 0.5).astype(np.float32)
         if self.object not in OBJECTS:
-            return ((at + 0.5) * cell - 0.5).astype(np.float32), None
+            return xy, None
         column, row = at.round().astype(int).T
-        counts = load_group(self.object, self.group).count_modes(row * width + column)
-        return ((at + 0.5) * cell - 0.5).astype(np.float32), counts
+        return xy, load_group(self.object, self.group).count_modes(row * width + column)
 
     def _find(self, place: Any) -> tuple[float, float]:
         """Column and row, with fractions, of a place."""
@@ -73,37 +71,21 @@ class Flat:
             u, v = map(float, along)
             if 0 <= u <= 1 and 0 <= v <= 1:
                 return u * (width - 1), v * (height - 1)
-        raise ValueError(f"places must be {self._accepted()}, or a list of these, got {place!r:.80}")
-
-    def _accepted(self) -> str:
-        names = [
-            *map(repr, NAMES.get(self.object, {})),
-            f"a point's number below {self.outputs.descriptors[0].numel()}",
-        ]
-        return ", ".join(names) + {"cloth": ", (u, v) in [0, 1]", "rope": ", a fraction of its length"}.get(
-            self.object, ""
-        )
+        accepted = [*map(repr, NAMES.get(self.object, {})), f"a point's number below {height * width}"]
+        accepted += {"cloth": ["(u, v) in [0, 1]"], "rope": ["a fraction of its length"]}.get(self.object, [])
+        raise ValueError(f"places must be {', '.join(accepted)}, or a list of these, got {place!r:.80}")
 
 
 def lay_flat(descriptors: Tensor, object: str, group: str) -> Flat:
     """The object whose material points (P, D) are described so; ValueError for a cloth or rope of another P."""
     if object in OBJECTS and len(descriptors) != N_POINTS:
         raise ValueError(f"places of a {object} must be {N_POINTS}, got {len(descriptors)}")
-    cloth = object == "cloth"
-    rows = SIDE if cloth else 1
-    image, mask = _draw_cloth() if cloth else _draw_line(len(descriptors))
+    if object == "cloth":
+        rows, side = SIDE, SIDE * CLOTH_CELL_PX
+        image, mask = np.full((side, side, 3), OBJECT, np.uint8), np.ones((side, side), bool)
+        cv2.rectangle(image, (0, 0), (side - 1, side - 1), (EDGE,) * 3, thickness=3)
+    else:
+        rows, mask = 1, np.zeros((LINE_PX, len(descriptors)), bool)
+        mask[LINE_PX // 2 - 1 : LINE_PX // 2 + 1] = True
+        image = np.repeat(np.where(mask, EDGE, GROUND).astype(np.uint8)[..., None], 3, 2)
     return Flat(image, mask, Outputs(descriptors.T.unflatten(1, (rows, -1)).contiguous()), object, group)
-
-
-def _draw_cloth() -> tuple[np.ndarray, np.ndarray]:
-    side = SIDE * CLOTH_CELL_PX
-    image = np.full((side, side, 3), OBJECT, np.uint8)
-    cv2.rectangle(image, (0, 0), (side - 1, side - 1), (EDGE,) * 3, thickness=3)
-    return image, np.ones((side, side), bool)
-
-
-def _draw_line(count: int) -> tuple[np.ndarray, np.ndarray]:
-    mask = np.zeros((LINE_PX, count), bool)
-    mask[LINE_PX // 2 - 1 : LINE_PX // 2 + 1] = True
-    image = np.where(mask, EDGE, GROUND).astype(np.uint8)
-    return np.repeat(image[..., None], 3, 2), mask

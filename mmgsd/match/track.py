@@ -21,9 +21,9 @@ import cv2
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from mmgsd.images import check_mask, check_pixels, to_rgb
+from mmgsd.images import check_pixels, to_rgb
 from mmgsd.match.match import LIKELY, Match
-from mmgsd.match.matcher import Matcher, Pair, compute_scale
+from mmgsd.match.matcher import Matcher, Pair, compute_scale, take_image
 from mmgsd.video import open_video
 
 MEMORY = 8  # frames that a step may start from
@@ -139,9 +139,7 @@ class Tracker:
         return self._take(match, order[:, columns[chosen]], sure, absent)
 
     def _prepare(self, image: Any, mask: Any) -> Pair:
-        image = to_rgb(image)
-        self._matcher.compute_input_size(image)
-        mask = None if mask is None else check_mask(mask, image.shape[:2], "mask")
+        image, mask = take_image(self._matcher, image, mask)
         said = self._said0, *self._matcher.describe([image])
         return Pair(self._matcher, self._image0, image, said, self._mask0, mask)
 

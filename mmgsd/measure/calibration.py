@@ -1,16 +1,18 @@
-"""Calibration on simulations that were held out from training: a heatmap's scale, and what modes promise.
+"""Calibration on images that were not trained on: a heatmap's scale, how modes are read, and what they promise.
 
     python -m mmgsd calibrate WEIGHTS --data FOLDER         adds it to weights that are trained; their tensors stay
     python -m mmgsd calibrate WEIGHTS --unseen FOLDER …     by images of other simulations, how modes are read as well
 
 The tables of a `Calibration` are read from all pairs; its errors are those of each half by the tables of the other.
+A reading (`mmgsd.match.mixture.ModeReadout`) counts by what a robot can grasp: `mmgsd.measure.photographs` asks the
+same of photographs, which choose nothing.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -21,28 +23,25 @@ from torch import Tensor
 
 from mmgsd.checks import read_count, read_flag
 from mmgsd.config import EvaluateConfig
-from mmgsd.dataset import Dataset, hold_out, join_datasets, load_dataset, load_parts, sample_pairs
+from mmgsd.dataset import Dataset, hold_out, join_datasets, load_dataset, load_parts
+from mmgsd.match.match import RADIUS_PX
 from mmgsd.match.matcher import Matcher
-from mmgsd.measure.questions import ask, choose_points, describe, measure_mean_error, model_answer
-from mmgsd.measure.readout import choose_readout
-from mmgsd.measure.uncertainty import (
-    RADII_PX,
-    compute_confidence_error,
-    compute_coverage_error,
-    get_distances,
-    get_modes,
-    measure_modes,
-    recalibrate,
-)
+from mmgsd.match.mixture import ModeReadout, fit_modes
+from mmgsd.measure import uncertainty
+from mmgsd.measure.metrics import compute_query_errors
+from mmgsd.measure.questions import BATCH, ask, choose_points, describe, draw_pairs, measure_mean_error, model_answer
 from mmgsd.model.calibration import LEVELS, Calibration, Modes, compute_unit
+from mmgsd.model.network import compute_cell_centres
 from mmgsd.model.tensors import load_metadata, read_tensors, write_tensors
 from mmgsd.model.weights import PLACES
 from mmgsd.numerics import own_numerics
+from mmgsd.progress import ProgressBar
 
 BANDWIDTHS = (1 / 64, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2)  # of a contrastive heatmap, in margins
 TEMPERATURES = (0.1, 10.0)  # range in which the calibrated one is sought
-BATCH = 16  # images that are described at a time
 PICTURES = 400  # at most, that an object's places are described by
+POWERS, SHARPNESSES = (1.0, 1.25, 1.5, 2.0), (1.0, 2.0, 3.0, 4.0, 6.0, 8.0)  # of readings that are tried
+ALLOWED = 1.05  # times the RMSE of modes that are read as they are
 PAIRS, LEAST_PAIRS = 400, 40  # drawn, and the fewest: half of these can just tell the level of 95 %
 
 
@@ -68,8 +67,8 @@ def calibrate_weights(
         raise ValueError(f"dataset must be the one that {weights} was trained on, of fingerprint {note.get('data')}: "
                          f"{dataset} has {data.fingerprint}")  # fmt: skip
     held_out = join_datasets(*(hold_out(part)[1] for part in parts))
-    found = _calibrate(matcher, held_out, "dataset must hold out", pairs=pairs, points=points, progress=progress)
-    return _keep(weights, {"calibration": found}, describe_places(matcher, held_out))
+    how = {"pairs": pairs, "points": points, "progress": progress}
+    return _calibrate(weights, matcher, held_out, {}, "dataset must hold out", **how)
 
 
 @own_numerics()
@@ -80,7 +79,7 @@ def calibrate_unseen(
     """The same by the test images of data sets that were not trained on, from which a reading is chosen first.
 
     ``unseen`` are their folders, one or more, of other seeds than those that the weights are measured on. The reading
-    (`mmgsd.measure.readout.choose_readout`) is kept as ``power`` and ``sharpness``, the fingerprints as ``unseen``.
+    (`choose_readout`) is kept as ``power`` and ``sharpness``, the fingerprints as ``unseen``.
     Errors are those of `calibrate_weights`, and ValueError where a data set is that of the training.
     """
     overwrite, weights = read_flag("overwrite", overwrite), Path(weights)
@@ -92,37 +91,35 @@ def calibrate_unseen(
         if part.fingerprint == note.get("data"):
             raise ValueError(f"unseen must be data sets that {weights} was not trained on, got that: {part.folder}")
     data = join_datasets(*parts)
-    how = {"points": points, "progress": progress}
     readout = choose_readout(matcher, data, progress=read_flag("progress", progress))
-    found = _calibrate(matcher, data, "unseen must hold test", pairs=pairs, **how)
-    chosen = {"power": repr(readout.exponent), "sharpness": repr(readout.mean_exponent)}
-    note = {**chosen, "calibration": found, "unseen": json.dumps([p.fingerprint for p in parts])}
-    return _keep(weights, note, describe_places(matcher, data))
+    chosen = {"power": repr(readout.exponent), "sharpness": repr(readout.mean_exponent),
+              "unseen": json.dumps([part.fingerprint for part in parts])}  # fmt: skip
+    how = {"pairs": pairs, "points": points, "progress": progress}
+    return _calibrate(weights, matcher, data, chosen, "unseen must hold test", **how)
 
 
-def _calibrate(matcher: Matcher, data: Dataset, accepted: str, *, pairs: int, points: int, progress: bool) -> str:
-    """What the modes hold on ``data``, as metadata; ValueError of too few images."""
+def _calibrate(
+    weights: Path, matcher: Matcher, data: Dataset, chosen: dict[str, str], accepted: str, *,
+    pairs: int, points: int, progress: bool,
+) -> Path:  # fmt: skip
+    """Add to a file of weights what was ``chosen``, what its modes hold on ``data``, and the object's places."""
     pairs, points = read_count("pairs", pairs, least=LEAST_PAIRS), read_count("points", points, least=1)
     found = calibrate_modes(matcher, data, pairs=pairs, points=points, progress=read_flag("progress", progress))
     if found is None:
         raise ValueError(f"{accepted} images for at least {LEAST_PAIRS} pairs, got {len(data)} images")
-    return found.to_json()
-
-
-def _keep(weights: Path, found: dict[str, str], places: Tensor) -> Path:
-    """Add to a file's metadata, and the object's places; its network's tensors stay."""
+    places = describe_places(matcher, data).cpu()
     tensors, note = read_tensors(weights)
-    return write_tensors(weights, tensors | {PLACES: places.cpu()}, note | found)
+    return write_tensors(weights, tensors | {PLACES: places}, {**note, **chosen, "calibration": found.to_json()})
 
 
 @own_numerics()
-def describe_places(matcher: Matcher, data: Dataset, *, pictures: int = PICTURES, seed: int = 0) -> Tensor:
+def describe_places(matcher: Matcher, data: Dataset) -> Tensor:
     """What `Matcher.find` asks about, (P, D): the mean descriptor of each material point and its like ones.
 
-    Over ``pictures`` images of ``data``, drawn, or all that there are, where the points are seen. A point that none of
+    Over `PICTURES` images of ``data``, drawn, or all that there are, where the points are seen. A point that none of
     them shows has that of the nearest one by number which is seen.
     """
-    drawn = np.random.default_rng(seed).permutation(np.flatnonzero(data.present))[:pictures]
+    drawn = np.random.default_rng(0).permutation(np.flatnonzero(data.present))[:PICTURES]
     total = torch.zeros(data.n_points, matcher.config.descriptor_dim, dtype=torch.float64)
     seen = torch.zeros(data.n_points, 1, dtype=torch.float64)
     for batch in np.array_split(drawn, -(-len(drawn) // BATCH)):
@@ -138,9 +135,71 @@ def describe_places(matcher: Matcher, data: Dataset, *, pictures: int = PICTURES
     return mean[known][nearest].float()
 
 
+def choose_readout(
+    matcher: Matcher, data: Dataset, *, pairs: int = 120, points: int = 40, progress: bool = False
+) -> ModeReadout:
+    """The reading that finds the most matches that are seen in ``data``, which must not have been trained on.
+
+    Of `POWERS` and `SHARPNESSES` that with the largest found share less the spurious one, as `count_seen` counts them,
+    among those whose RMSE is at most `ALLOWED` times what it is without. Leaves it set on the matcher and returns it.
+    """
+    asked = list(_ask_seen(matcher, data, EvaluateConfig(pairs=pairs, points=points)))
+    plain = ModeReadout(matcher.readout.shape_prior)
+    readouts = [dataclasses.replace(plain, exponent=a, mean_exponent=b) for a in POWERS for b in SHARPNESSES]
+    bar = ProgressBar(readouts, desc="choose a reading", disable=not progress, leave=False)
+    quality = {readout: measure_readout(asked, readout, data.size) for readout in bar}
+    allowed = {readout: gain for readout, (rmse, gain) in quality.items() if rmse <= ALLOWED * quality[plain][0]}
+    matcher.readout = max(allowed, key=allowed.get)
+    return matcher.readout
+
+
+def _ask_seen(
+    matcher: Matcher, data: Dataset, config: EvaluateConfig
+) -> Iterator[tuple[Tensor, np.ndarray, np.ndarray]]:
+    """Of each pair the points seen in its first image: heatmaps (S, h, w), true matches (S, n, 2), which are seen."""
+    chosen, points = draw_pairs(data, config), choose_points(config.points, data.n_points)
+    outputs, group = describe(matcher, data, np.unique(chosen)), data.group(matcher.config.group).permutations
+    points = points[[len(np.unique(group[:, point])) == len(group) for point in points]]  # none of a symmetry's centre
+    for first, second in chosen:
+        shown = points[data.visible[first, points]]
+        if len(shown):
+            xy, orbits = torch.from_numpy(data.xy[first, shown]), group[:, shown].T  # (S, 2), (S, n)
+            heatmaps = matcher.compute_heatmaps(outputs[first], outputs[second], xy, data.size)
+            yield heatmaps, data.xy[second][orbits].astype(float), data.visible[second][orbits]
+
+
+def measure_readout(
+    asked: list[tuple[Tensor, np.ndarray, np.ndarray]], readout: ModeReadout, size: tuple[int, int]
+) -> tuple[float, float]:
+    """Mean RMSE in px, and mean found share less the spurious one, on questions about images of ``size``."""
+    rows = []
+    for heatmaps, true, seen in asked:
+        fit = fit_modes(heatmaps, true.shape[1], *compute_cell_centres(size, heatmaps.shape[-2:]), readout=readout)
+        modes, covariances = (t.double().cpu().numpy() for t in (fit.modes, fit.covariances))
+        rows.append((compute_query_errors(modes, covariances, true)["rmse_px"], *count_seen(modes, true, seen)))
+    rmse_px, found, spurious = (float(np.concatenate(values).mean()) for values in zip(*rows, strict=True))
+    return rmse_px, found - spurious
+
+
+def count_seen(modes: np.ndarray, true: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Shares found and spurious (Q,) of the Q queries with a match that is seen.
+
+    ``modes`` and ``true`` (S, n, 2) px, ``seen`` (S, n) bool. Found: of the seen matches those with a mode within
+    `RADIUS_PX`. Spurious: of the k most probable modes, k matches being seen, those twice as far from all of them.
+    """
+    asked = seen.any(1)
+    modes, true, seen = modes[asked], true[asked], seen[asked]
+    distance = np.linalg.norm(modes[:, :, None] - true[:, None], axis=-1)  # (Q, modes, matches)
+    count = seen.sum(1)
+    found = ((distance.min(1) < RADIUS_PX) & seen).sum(1) / count
+    far = np.where(seen[:, None], distance, np.inf).min(2) > 2 * RADIUS_PX  # (Q, modes)
+    first = np.arange(modes.shape[1]) < count[:, None]
+    return found, (far & first).sum(1) / count
+
+
 @own_numerics()
 def calibrate_modes(
-    matcher: Matcher, data: Dataset, *, pairs: int = PAIRS, points: int = 10, seed: int = 0, progress: bool = False
+    matcher: Matcher, data: Dataset, *, pairs: int = PAIRS, points: int = 10, progress: bool = False
 ) -> Calibration | None:
     """What the modes of a matcher hold on ``data``, which must not have been trained on; None of too few images.
 
@@ -148,7 +207,7 @@ def calibrate_modes(
     on the matcher and returns it.
     """
     shown = int(data.present.sum())
-    config = EvaluateConfig(pairs=min(pairs, shown * (shown - 1)), points=points, seed=seed)
+    config = EvaluateConfig(pairs=min(pairs, shown * (shown - 1)), points=points)
     if config.pairs < LEAST_PAIRS:
         return None
     queries = ask(model_answer(matcher, data, config), data, config, matcher.config.group, progress, "held out")
@@ -157,15 +216,14 @@ def calibrate_modes(
     halves = [queries[queries["pair"] % 2 == half] for half in (0, 1)]
     errors = [check_calibration(fit_calibration(one), other) for one, other in (halves, halves[::-1])]
     ellipse, confidence = (round(float(error), 4) for error in np.mean(errors, 0))
-    found = dataclasses.replace(fit_calibration(queries), ece_ellipse=ellipse, ece_confidence=confidence)
-    matcher.calibration = found
+    matcher.calibration = dataclasses.replace(fit_calibration(queries), ece_ellipse=ellipse, ece_confidence=confidence)
     return matcher.calibration
 
 
 def fit_calibration(queries: pd.DataFrame) -> Calibration:
     """The calibration of a table of answers (`mmgsd.measure.evaluation.load_queries`): its visible sources count."""
-    rows = get_modes(queries)
-    modes, distance = measure_modes(rows), rows.distance_px.to_numpy()
+    rows = uncertainty.get_modes(queries)
+    modes, distance = uncertainty.measure_modes(rows), rows.distance_px.to_numpy()
     powers = fit_powers(modes, distance)
     unit, pair = compute_unit(modes, powers), rows["pair"].to_numpy()
     ellipse = find_quantiles(np.sqrt(rows.mahalanobis2.to_numpy()) * modes.spread / unit, pair)
@@ -175,8 +233,9 @@ def fit_calibration(queries: pd.DataFrame) -> Calibration:
 
 def check_calibration(calibration: Calibration, queries: pd.DataFrame) -> tuple[float, float]:
     """Expected calibration errors of ellipses and confidences on answers that it was not fitted to."""
-    ellipse = compute_coverage_error(get_distances(recalibrate(queries, calibration)))
-    return ellipse, compute_confidence_error(get_modes(queries), calibration)
+    distances = uncertainty.get_distances(uncertainty.recalibrate(queries, calibration))
+    modes = uncertainty.get_modes(queries)
+    return uncertainty.compute_coverage_error(distances), uncertainty.compute_confidence_error(modes, calibration)
 
 
 def find_quantiles(scores: np.ndarray, pair: np.ndarray) -> np.ndarray:
@@ -195,10 +254,10 @@ def find_quantiles(scores: np.ndarray, pair: np.ndarray) -> np.ndarray:
 def fit_powers(modes: Modes, distance: np.ndarray) -> tuple[float, ...]:
     """Powers (3,) of M modes' spread, share and effective size in what their ``distance`` (M,) px is measured by.
 
-    A logistic model tells of each radius of `RADII_PX` whether the distance is within it, from the logarithms of all;
-    the most likely one's slopes, by the radius', are the powers.
+    A logistic model tells of each radius of `uncertainty.RADII_PX` whether the distance is within it, from the
+    logarithms of all; the most likely one's slopes, by the radius', are the powers.
     """
-    radii = np.log(RADII_PX)  # (R,)
+    radii = np.log(uncertainty.RADII_PX)  # (R,)
     within = np.log(np.maximum(distance, 1e-6))[:, None] <= radii
     known = np.stack([*(np.log(np.maximum(each, 1e-6)) for each in modes), np.ones(len(distance))], 1)  # (M, 4)
 
@@ -214,12 +273,12 @@ def fit_powers(modes: Modes, distance: np.ndarray) -> tuple[float, ...]:
 
 
 @own_numerics()
-def calibrate_bandwidth(matcher: Matcher, data: Dataset, *, pairs: int = 8, points: int = 80, seed: int = 0) -> float:
+def calibrate_bandwidth(matcher: Matcher, data: Dataset, *, pairs: int = 8, points: int = 80) -> float:
     """The heatmap bandwidth with the least mean error on ``data``: contrastive descriptors have no scale.
 
     Leaves it set on the matcher and returns it (descriptor units).
     """
-    config, errors = EvaluateConfig(pairs=pairs, points=points, seed=seed), {}
+    config, errors = EvaluateConfig(pairs=pairs, points=points), {}
     answer = model_answer(matcher, data, config)
     for bandwidth in (matcher.config.margin * b for b in BANDWIDTHS):
         matcher.bandwidth = bandwidth
@@ -229,14 +288,12 @@ def calibrate_bandwidth(matcher: Matcher, data: Dataset, *, pairs: int = 8, poin
 
 
 @own_numerics()
-def calibrate_temperature(
-    matcher: Matcher, data: Dataset, *, pairs: int = 32, points: int = 40, seed: int = 0
-) -> float:
+def calibrate_temperature(matcher: Matcher, data: Dataset, *, pairs: int = 32, points: int = 40) -> float:
     """The temperature with the least negative log-likelihood of the true matches on ``data`` (Guo et al., ICML 2017).
 
     ``data`` must not have been trained on. Leaves it set on the matcher and returns it.
     """
-    chosen = sample_pairs(data.episode, pairs, np.random.default_rng(seed), present=data.present)
+    chosen = draw_pairs(data, EvaluateConfig(pairs=pairs))
     descriptors, points = describe(matcher, data, np.unique(chosen)), choose_points(points, data.n_points)
     orbits = data.group(matcher.config.group).permutations[:, points].T  # (S, G)
     matcher.temperature, logits, true = 1.0, [], []

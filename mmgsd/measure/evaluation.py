@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -42,26 +44,26 @@ def evaluate_model(
     modes. ValueError for ``modes`` that are not from 0 to `mmgsd.config.MAX_MODES`, for another ``temperature`` than a
     number above 0, and for weights that were taught another object than the data set shows.
     """
-    overwrite, progress = read_flag("overwrite", overwrite), read_flag("progress", progress)
-    modes, out = read_count("modes", modes), Path(out)
+    modes = read_count("modes", modes)
     if modes:
         check_modes(modes)
     check_scales(temperature=temperature)
-    data = load_dataset(dataset, "test")
     method = hashlib.sha256(Path(weights).read_bytes()).hexdigest()
     method += "" if temperature is None else f" at temperature {temperature:g}"
     method += f" of {modes} modes" if modes else ""
     method += f" by {readout}" if readout else ""
-    question = _describe_question(data, config, group, method)
-    if not overwrite and is_kept(out, lambda table: load_queries(table).attrs == question):
-        return out
-    matcher = Matcher.load(weights)
-    if temperature is not None:
-        matcher.temperature = temperature
-    if readout is not None:
-        matcher.readout = readout
-    answer = model_answer(matcher, data, config)
-    return _answer_all(answer, data, config, group, out, question, progress, modes)
+
+    def make_answer(data: Dataset) -> AnswerFunction:
+        """The weights' answers, read as they are asked to."""
+        matcher = Matcher.load(weights)
+        if temperature is not None:
+            matcher.temperature = temperature
+        if readout is not None:
+            matcher.readout = readout
+        return model_answer(matcher, data, config)
+
+    how = {"overwrite": overwrite, "progress": progress}
+    return _answer_all(make_answer, method, dataset, config, out, group=group, modes=modes, **how)
 
 
 def evaluate_baseline(
@@ -74,15 +76,9 @@ def evaluate_baseline(
     """
     if method not in BASELINES + OPTIONAL + CHANCE:
         raise ValueError(f"method must be one of {BASELINES + CHANCE}, got {method!r}")
-    overwrite, progress = read_flag("overwrite", overwrite), read_flag("progress", progress)
-    out = Path(out)
-    data = load_dataset(dataset, "test")
     asked = method if readout == AS_IT_IS else f"{method} by {readout}"
-    question = _describe_question(data, config, group, asked)
-    if not overwrite and is_kept(out, lambda table: load_queries(table).attrs == question):
-        return out
-    answer = _chance_answer(method, data) if method in CHANCE else _classical_answer(method, data, readout)
-    return _answer_all(answer, data, config, group, out, question, progress)
+    make_answer = partial(_chance_answer, method) if method in CHANCE else partial(_classical_answer, method, readout)
+    return _answer_all(make_answer, asked, dataset, config, out, group=group, overwrite=overwrite, progress=progress)
 
 
 def load_queries(path: Path) -> pd.DataFrame:
@@ -147,7 +143,7 @@ def _is_nested(values: Any, depth: int) -> bool:
     return isinstance(values, dict) and (depth == 0 or all(_is_nested(value, depth - 1) for value in values.values()))
 
 
-def _classical_answer(method: str, data: Dataset, readout: ModeReadout) -> AnswerFunction:
+def _classical_answer(method: str, readout: ModeReadout, data: Dataset) -> AnswerFunction:
     images = [data.load_image(i) for i in range(len(data))]
     masks = [data.load_mask(i) for i in range(len(data))]
     matcher, last = BaselineMatcher(method), np.array(data.size, dtype=np.float32) - 0.5
@@ -186,12 +182,17 @@ def _describe_question(data: Dataset, config: EvaluateConfig, group: str, method
 
 
 def _answer_all(
-    answer: AnswerFunction, data: Dataset, config: EvaluateConfig, group: str, out: Path, question: dict[str, str],
-    progress: bool, modes: int = 0,
+    make_answer: Callable[[Dataset], AnswerFunction], method: str, dataset: Path, config: EvaluateConfig, out: Path, *,
+    group: str, overwrite: bool, progress: bool, modes: int = 0,
 ) -> Path:  # fmt: skip
-    """Ask every query and write the table of answers, each page of it with a checksum."""
+    """Ask every query, unless the table is there, and write it, each page of it with a checksum."""
+    overwrite, progress = read_flag("overwrite", overwrite), read_flag("progress", progress)
+    data, out = load_dataset(dataset, "test"), Path(out)
+    question = _describe_question(data, config, group, method)
+    if not overwrite and is_kept(out, lambda table: load_queries(table).attrs == question):
+        return out
     with saying_what_stays(lambda: f"stopped: nothing of {out} is kept, tables that are finished are"):
-        table = ask(answer, data, config, group, progress, out.stem, modes)
+        table = ask(make_answer(data), data, config, group, progress, out.stem, modes)
     table.attrs = question
     with atomic_write(out) as aside:
         table.to_parquet(aside, index=False, write_page_checksum=True)

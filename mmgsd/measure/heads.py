@@ -14,13 +14,12 @@ from mmgsd.checks import read_flag
 from mmgsd.config import EvaluateConfig, digest
 from mmgsd.dataset import Dataset, load_dataset
 from mmgsd.files import is_kept, write_json
-from mmgsd.match.matcher import Matcher, read_heatmap
+from mmgsd.match.matcher import Matcher
 from mmgsd.measure.evaluation import read_results
 from mmgsd.measure.metrics import assign_modes
-from mmgsd.measure.questions import choose_points, describe, draw_pairs
+from mmgsd.measure.questions import choose_points, describe, draw_pairs, read_modes
 from mmgsd.measure.uncertainty import compute_auroc
 from mmgsd.model.heads import Outputs, look_up
-from mmgsd.model.network import compute_cell_centres
 from mmgsd.progress import ProgressBar
 
 MEASURES = ("mask_iou", "auroc_on_object", "auroc_visible", "auroc_absent", "auroc_absent_textile",
@@ -104,18 +103,10 @@ def _ask_modes(
     for first, second in ProgressBar(draw_pairs(data, config), desc="heads", disable=not progress, leave=False):
         seen = data.visible[first, points]
         xy, orbit = torch.from_numpy(data.xy[first, points[seen]]), orbits[seen]
-        modes = _find_modes(matcher, outputs[first], outputs[second], xy, data.size, n=orbits.shape[1])
-        visible = matcher.compute_visible(outputs[first], outputs[second], xy, modes, (data.size, data.size))
+        said = outputs[first], outputs[second]
+        modes = read_modes(matcher, *said, xy, data.size, orbits.shape[1])[0].modes
+        visible = matcher.compute_visible(*said, xy, modes, (data.size, data.size))
         paired = assign_modes(modes.double().cpu().numpy(), data.xy[second][orbit].astype(float))  # of each true match
         scores.append(np.take_along_axis(visible.cpu().numpy(), paired, 1).ravel())
         true.append(data.visible[second][orbit].ravel())
     return np.concatenate(scores), np.concatenate(true)
-
-
-def _find_modes(
-    matcher: Matcher, said0: Outputs, said1: Outputs, xy: torch.Tensor, size: tuple[int, int], *, n: int
-) -> torch.Tensor:
-    """Modes (S, n, 2) px of source pixels (S, 2)."""
-    heatmap = matcher.compute_heatmaps(said0, said1, xy, size)
-    centres = compute_cell_centres(size, heatmap.shape[-2:])
-    return read_heatmap(heatmap, n, centres, readout=matcher.readout)[0].modes

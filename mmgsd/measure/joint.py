@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+import pandas as pd
 
 from mmgsd.command import Option
 from mmgsd.config import DEFAULT_GROUP, EvaluateConfig
@@ -65,10 +66,8 @@ def measure_joint(name: str, root: Path, *, pairs: int = PAIRS, progress: bool =
             found.setdefault(str(data.labels.state[second]), []).extend(asked)
         row[preset] = {kind: summarise_questions(asked) for kind, asked in sorted(found.items())}
     took = {joint: round(1000 * statistics.median(values)) for joint, values in seconds.items()}
-    return row | {
-        "milliseconds": {"joint": took[True], "alone": took[False]},
-        "hardware": name_hardware(matcher.device),
-    }
+    row["milliseconds"] = {"joint": took[True], "alone": took[False]}
+    return row | {"hardware": name_hardware(matcher.device)}
 
 
 def judge_questions(
@@ -103,12 +102,9 @@ def _measure_swaps(near: np.ndarray) -> float:
 
 def summarise_questions(asked: list[dict[str, float]]) -> dict[str, float]:
     """{measure: mean over questions, "questions": how many}; None where no question has the measure."""
-    said: dict[str, Any] = {"questions": len(asked)}
-    for name in (*CHOSEN, *SWAPS):
-        values = np.array([row[name] for row in asked], float)
-        known = values[np.isfinite(values)]
-        said[name] = round(float(known.mean()), 4) if len(known) else None
-    return said
+    means = pd.DataFrame(asked, columns=[*CHOSEN, *SWAPS], dtype=float).mean()
+    known = {name: None if np.isnan(mean) else round(float(mean), 4) for name, mean in means.items()}
+    return {"questions": len(asked), **known}
 
 
 def main(*names: Annotated[str, Option("of weights in data/weights, or files")]) -> None:

@@ -29,10 +29,8 @@ class ErrorSummary:
 def assign_modes(modes: np.ndarray, true: np.ndarray) -> np.ndarray:
     """Index (S, n) of the predicted mode that each true one is paired with: the least total squared error.
 
-    ``modes`` and ``true`` (S, n, 2) px. Raises ValueError where the shapes differ.
+    ``modes`` and ``true`` (S, n, 2) px.
     """
-    if modes.shape != true.shape or modes.ndim != 3:
-        raise ValueError(f"modes and true must share one shape (S, n, 2), got {modes.shape} and {true.shape}")
     squared = np.square(true[:, :, None] - modes[:, None]).sum(-1)  # (S, true, predicted)
     n = true.shape[1]
     if n <= 4:

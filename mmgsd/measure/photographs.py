@@ -182,17 +182,16 @@ def measure_answers(
         rows.append(score_answer(answer, photograph))
     about = {"photographs": len(photographs), "marks": digest_marks(photographs)}
     found = about | summarise_photographs(pd.concat(rows, ignore_index=True))
-    named = measure_by_name(matcher, photographs)
-    return found if named is None else found | {"by_name": named}
+    named = ask_by_name(matcher, photographs)
+    return found | {"by_name": summarise_photographs(pd.concat(named, ignore_index=True))} if named else found
 
 
-def measure_by_name(matcher: Any, photographs: list[Photograph]) -> dict[str, Any] | None:
-    """`summarise_photographs` of the corners or ends that `Matcher.find` finds; None of what cannot be asked so."""
-    name = ENDS.get(getattr(matcher, "object", ""), ("",))[0]
-    if getattr(matcher, "places", None) is None or not name:
-        return None
-    rows = [score_answer(matcher.find(photograph.read(), name), photograph) for photograph in photographs]
-    return summarise_photographs(pd.concat(rows, ignore_index=True))
+def ask_by_name(matcher: Any, photographs: list[Photograph]) -> list[pd.DataFrame]:
+    """A row a photograph, as of `score_answer`, of the corners or ends that `Matcher.find` finds; [] if it cannot."""
+    if getattr(matcher, "places", None) is None or matcher.object not in ENDS:
+        return []
+    return [score_answer(matcher.find(photograph.read(), ENDS[matcher.object][0]), photograph)
+            for photograph in photographs]  # fmt: skip
 
 
 def digest_marks(photographs: list[Photograph]) -> str:
@@ -214,16 +213,15 @@ def store_photographs(results: dict[str, Any], name: str) -> Path:
 
 
 def ask_photographs(
-    matcher: Any, photographs: list[Photograph], *, targets: list[Photograph] | None = None, sources: int = SOURCES,
-    progress: bool = True,
-) -> Iterator[tuple[Photograph, Match]]:  # fmt: skip
-    """(photograph, answer) for the places of the sources in each other photograph, which is read and described once.
+    matcher: Any, photographs: list[Photograph], *, targets: list[Photograph] | None = None, progress: bool = True
+) -> Iterator[tuple[Photograph, Match]]:
+    """(photograph, answer) for the places of `SOURCES` in each other photograph, which is read and described once.
 
     ``matcher``: anything with ``match_many``. ``targets`` are asked about in place of the others. Where no photograph
     has all of its places marked, any is a source.
     """
     askable = [photograph for photograph in photographs if photograph.askable] or photographs
-    spread = np.linspace(0, len(askable) - 1, min(sources, len(askable))).round().astype(int)
+    spread = np.linspace(0, len(askable) - 1, min(SOURCES, len(askable))).round().astype(int)
     read = [(source, source.read()) for source in (askable[k] for k in np.unique(spread))]
     targets = photographs if targets is None else targets
     pairs = [(source, target) for target in targets for source in read if source[0].path != target.path]
@@ -263,10 +261,10 @@ def summarise_photographs(rows: pd.DataFrame) -> dict[str, Any]:
     return _summarise(rows) | {"intervals": estimate_intervals(rows), "sources": sources}
 
 
-def estimate_intervals(rows: pd.DataFrame, *, seed: int = 0) -> dict[str, list[float] | None]:
+def estimate_intervals(rows: pd.DataFrame) -> dict[str, list[float] | None]:
     """{measure: low and high of its mean's 95 % interval}, photographs drawn anew; None where nothing was answered."""
     each = rows.groupby("file")[list(MEASURES)].agg(["sum", "count"])
-    drawn = np.random.default_rng(seed).integers(len(each), size=(DRAWS, len(each)))
+    drawn = np.random.default_rng(0).integers(len(each), size=(DRAWS, len(each)))
     intervals: dict[str, list[float] | None] = {}
     for name in MEASURES:
         total, count = (each[name][key].to_numpy()[drawn].sum(1) for key in ("sum", "count"))
@@ -295,14 +293,12 @@ def describe_marks(file: str, pins: list[Any], kind: str = "") -> dict[str, Any]
     return {"file": file, **({"kind": kind} if kind else {}), key: places}
 
 
-def mark_dataset(folder: Path | str, relative: str, *, split: str = "test") -> list[dict[str, Any]]:
-    """What describes a data set's images as photographs: the visible corners of its cloths, or ends of its ropes.
+def mark_dataset(folder: Path | str, relative: str) -> list[dict[str, Any]]:
+    """What describes a data set's test images as photographs: the visible corners of cloths, or the ends of ropes.
 
-    ``relative`` is the folder's path from where the JSON file will lie. ValueError for another object.
+    ``relative`` is the folder's path from where the JSON file will lie.
     """
-    data = load_dataset(folder, split)
-    if data.object not in ENDS:
-        raise ValueError(f"folder must hold a data set of one of {', '.join(ENDS)}, got one of {data.object!r}")
+    data = load_dataset(folder, "test")
     key, points = ENDS[data.object]
     entries = []
     for file, xy, visible in zip(data.labels.file, data.xy, data.visible, strict=True):

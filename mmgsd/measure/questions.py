@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import numpy as np
 import pandas as pd
@@ -18,6 +18,7 @@ from mmgsd.model.heads import Outputs
 from mmgsd.model.network import compute_cell_centres
 from mmgsd.progress import ProgressBar
 
+BATCH = 16  # images that are described at a time
 AnswerFunction = Callable[[int, int, np.ndarray, np.ndarray], tuple[Mixture, Tensor]]
 
 
@@ -67,27 +68,30 @@ def model_answer(matcher: Matcher, data: Dataset, config: EvaluateConfig) -> Ans
 
     def answer(first: int, second: int, xy: np.ndarray, n: np.ndarray) -> tuple[Mixture, Tensor]:
         """Modes and entropies (nats) of pixels ``xy`` of the first image."""
-        heatmap = matcher.compute_heatmaps(descriptors[first], descriptors[second], torch.from_numpy(xy), data.size)
-        centres = compute_cell_centres(data.size, heatmap.shape[-2:])
-        return read_heatmap(heatmap, torch.from_numpy(n), centres, readout=matcher.readout)
+        said = descriptors[first], descriptors[second]
+        return read_modes(matcher, *said, torch.from_numpy(xy), data.size, torch.from_numpy(n))
 
     return answer
 
 
-def describe(matcher: Matcher, data: Dataset, indices: np.ndarray, *, batch: int = 16) -> dict[int, Outputs]:
+def read_modes(
+    matcher: Matcher, said0: Outputs, said1: Outputs, xy: Tensor, size: tuple[int, int], n: int | Tensor
+) -> tuple[Mixture, Tensor]:
+    """``n`` modes and entropies (nats) of source pixels (S, 2), of two images of one ``size``."""
+    heatmap = matcher.compute_heatmaps(said0, said1, xy, size)
+    return read_heatmap(heatmap, n, compute_cell_centres(size, heatmap.shape[-2:]), readout=matcher.readout)
+
+
+def describe(matcher: Matcher, data: Dataset, indices: np.ndarray) -> dict[int, Outputs]:
     """What the network says of the images, computed once each; ValueError for images of another object."""
     if matcher.object and matcher.object != data.object:
         raise ValueError(f"weights must be of the object {data.object!r} of {data.folder}, got weights of "
                          f"{matcher.object!r}")  # fmt: skip
-    return dict(_describe_batches(matcher, data, indices, batch))
-
-
-def _describe_batches(
-    matcher: Matcher, data: Dataset, indices: np.ndarray, batch: int
-) -> Iterator[tuple[int, Outputs]]:
-    for start in range(0, len(indices), batch):
-        chosen = indices[start : start + batch]
-        yield from zip(chosen.tolist(), matcher.describe([data.load_image(i) for i in chosen]), strict=True)
+    described = {}
+    for start in range(0, len(indices), BATCH):
+        chosen = indices[start : start + BATCH]
+        described |= zip(chosen.tolist(), matcher.describe([data.load_image(i) for i in chosen]), strict=True)
+    return described
 
 
 def measure_rmse(matcher: Matcher, data: Dataset, *, pairs: int = 60, points: int = 125, seed: int = 0) -> float:

@@ -16,20 +16,22 @@ CORNER, BORDER, INTERIOR = 5, 3, 13  # points: side of a corner's block, width o
 MAP = "map_px"  # the key of the error of each point
 
 
-def find_regions(side: int = SIDE) -> dict[str, np.ndarray]:
-    """Material points (side²,) bool of a cloth's ``corner`` blocks, the rest of its ``edge``, and its ``interior``."""
-    row, column = np.divmod(np.arange(side * side), side)
-    from_edge = np.stack([np.minimum(v, side - 1 - v) for v in (row, column)])
+def _count_from_edge() -> np.ndarray:
+    """(2, 625) rows and columns between each material point and the nearest edge."""
+    return np.stack([np.minimum(v, SIDE - 1 - v) for v in np.divmod(np.arange(N_POINTS), SIDE)])
+
+
+def find_regions() -> dict[str, np.ndarray]:
+    """Material points (625,) bool of a cloth's ``corner`` blocks, the rest of its ``edge``, and its ``interior``."""
+    from_edge = _count_from_edge()
     corner = (from_edge < CORNER).all(0)
     edge = (from_edge < BORDER).any(0) & ~corner
-    return {"corner": corner, "edge": edge, "interior": (from_edge >= (side - INTERIOR) // 2).all(0)}
+    return {"corner": corner, "edge": edge, "interior": (from_edge >= (SIDE - INTERIOR) // 2).all(0)}
 
 
 def measure_rings(errors: Sequence[float | None]) -> list[float | None]:
     """Mean of a cloth's 625 values by ring, from the border inwards; None of a ring without any."""
-    row, column = np.divmod(np.arange(SIDE * SIDE), SIDE)
-    ring = np.stack([np.minimum(v, SIDE - 1 - v) for v in (row, column)]).min(0)
-    means = pd.Series(np.array(errors, float)).groupby(ring).mean()
+    means = pd.Series(np.array(errors, float)).groupby(_count_from_edge().min(0)).mean()
     return [None if np.isnan(mean) else round(float(mean), 2) for mean in means]
 
 

@@ -1,4 +1,11 @@
-"""What weights, and what one would pick instead, do on clean renders, on cluttered ones and on photographs."""
+"""What weights, and what one would pick instead, do on clean renders, cluttered ones, others' and on photographs.
+
+Others' renders are of one cloth whose material points' pixels are told. Their folder is as that of
+`priyasundaresan/cloth-rendering` has its ``texture_images``: pictures ``000001_rgb.png``, …, and in
+``knots_info.json``, by a picture's number, a list of the pixels of its 25 × 25 points, row by row: [[[x, y]], …].
+The square at the left of each picture is asked about: each ordered pair, every second point of each row and column,
+whether it is seen or not, and all its matches under ``c4``.
+"""
 
 from __future__ import annotations
 
@@ -7,42 +14,41 @@ import hashlib
 import statistics
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import permutations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from mmgsd.config import EvaluateConfig, load_preset
+from mmgsd.config import DEFAULT_GROUP, N_POINTS, EvaluateConfig, load_preset
 from mmgsd.dataset import load_dataset
 from mmgsd.dataset_format import SPLITS
-from mmgsd.files import read_json
+from mmgsd.files import DamagedFileError, read_json
+from mmgsd.images import read_image
 from mmgsd.match.baselines import BaselineMatcher, FeatureMatcher
 from mmgsd.match.match import RADIUS_PX, Match
 from mmgsd.match.matcher import Matcher, find_weights
 from mmgsd.match.mixture import AS_IT_IS, ModeReadout
-from mmgsd.measure.cloth_renders import measure_cloth_renders
+from mmgsd.measure import uncertainty
 from mmgsd.measure.evaluation import evaluate_baseline, evaluate_model, load_queries
 from mmgsd.measure.heads import MEASURES as HEADS
 from mmgsd.measure.heads import evaluate_heads
-from mmgsd.measure.metrics import aggregate
+from mmgsd.measure.metrics import aggregate, compute_query_errors
 from mmgsd.measure.photographs import measure_answers, measure_photographs, read_photographs
-from mmgsd.measure.uncertainty import (
-    compute_confidences,
-    compute_reliability,
-    get_modes,
-    measure_modes,
-    summarise_uncertainty,
-)
+from mmgsd.measure.regions import SIDE
 from mmgsd.model.calibration import Calibration
 from mmgsd.model.network import name_hardware
 from mmgsd.paths import Paths
+from mmgsd.symmetry import load_group
 
 SETS = ("paper", "workspace")  # presets whose test images are asked about
 LEVEL = 0.9  # of the radii whose promise is checked
 HEAD_PAIRS = 100  # of images whose modes are judged
 TIMED = 9  # questions, of which the median counts
 PLAIN = ("flat", "straight")  # states of the objects
+CLOTH_LABELS, CLOTH_PICTURES = "knots_info.json", "*_rgb.png"  # of others' renders
+STEP = 2  # of the rows and columns of a cloth's points that are asked about in these
 SIDE_POINTS = {"cloth": 25, "rope": 625}  # material points, the first ones, that lie along it
 
 
@@ -52,17 +58,16 @@ def measure_weights(
 ) -> dict[str, Any]:  # fmt: skip
     """The row of ``weights``, or of shipped ones: a dictionary a set of `SETS`, ``photographs``, ``milliseconds``.
 
-    Of a set: `mmgsd.measure.metrics.aggregate` over visible sources, `summarise_uncertainty` by the weights' own
-    calibration, its ``reliability`` beside a Gaussian's, ``within_radius``, the share of modes with a true match within
-    `Match.radius_px` (level 0.9), and ``heads`` (`measure_heads`). ``milliseconds``: of one question about two images.
+    Of a set: `mmgsd.measure.metrics.aggregate` over visible sources, `mmgsd.measure.uncertainty.summarise_uncertainty`
+    by the weights' own calibration, its ``reliability`` beside a Gaussian's, ``within_radius``, the share of modes with
+    a true match within `Match.radius_px` (level 0.9), and ``heads`` (`measure_heads`). ``milliseconds``: of one
+    question about two images.
     ``presets`` are those whose images stand for `SETS`; without any, neither they nor the time are measured.
-    ``cloth_renders`` of a cloth's weights: `mmgsd.measure.cloth_renders.measure_cloth_renders`.
+    ``cloth_renders`` of a cloth's weights: `measure_cloth_renders`.
     """
     file = weights or find_weights(name)
     matcher = Matcher.load(file)
-    row = {"object": matcher.object, "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
-           "calibrated": matcher.calibration is not None, "power": matcher.readout.exponent,
-           "sharpness": matcher.readout.mean_exponent}  # fmt: skip
+    row = _describe_weights(file, matcher, calibrated=matcher.calibration is not None)
     for kind, preset in zip(SETS, presets, strict=bool(presets)):
         paths = Paths(root, preset)
         data, config = paths.dataset(matcher.object), load_preset(preset).evaluate
@@ -90,8 +95,7 @@ def measure_read(
     file = find_weights(weights)
     matcher = Matcher.load(file)
     readout = matcher.readout = parse_readout(numbers, matcher.readout)
-    row: dict[str, Any] = {"object": matcher.object, "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
-                           "power": readout.exponent, "sharpness": readout.mean_exponent}  # fmt: skip
+    row = _describe_weights(file, matcher)
     for preset in presets:
         paths = Paths(root, preset)
         data, out = paths.dataset(matcher.object), paths.queries(f"shipped-{name}")
@@ -103,6 +107,12 @@ def measure_read(
     if cloth_renders and matcher.object == "cloth":
         row["cloth_renders"] = measure_cloth_renders(matcher, cloth_renders)
     return row
+
+
+def _describe_weights(file: Path, matcher: Matcher, **known: Any) -> dict[str, Any]:
+    """What a row says of its weights, and how they are read."""
+    weights = {"object": matcher.object, "sha256": hashlib.sha256(file.read_bytes()).hexdigest(), **known}
+    return {**weights, "power": matcher.readout.exponent, "sharpness": matcher.readout.mean_exponent}
 
 
 def name_read(name: str, row: Mapping[str, Any]) -> str:
@@ -122,19 +132,21 @@ def parse_readout(text: str, like: ModeReadout) -> ModeReadout:
 
 def _summarise(table: Path, matcher: Matcher) -> dict[str, Any]:
     queries = load_queries(table)
-    modes, calibration = get_modes(queries), matcher.calibration
+    modes, calibration = uncertainty.get_modes(queries), matcher.calibration
     within, promises = None, {"Gaussian": None, "calibrated": calibration}
     if calibration is not None:
-        radius = calibration.compute_radius(LEVEL, measure_modes(modes))
+        radius = calibration.compute_radius(LEVEL, uncertainty.measure_modes(modes))
         within = round(float(np.mean(modes.distance_px.to_numpy() <= radius)), 4)
-    return {**aggregate(queries[queries.visible]), **summarise_uncertainty(queries, calibration=calibration),
-            "within_radius": within,
-            "reliability": {name: _list_reliability(modes, promise) for name, promise in promises.items()}}  # fmt: skip
+    summary = aggregate(queries[queries.visible])
+    summary |= uncertainty.summarise_uncertainty(queries, calibration=calibration)
+    reliability = {name: _list_reliability(modes, promise) for name, promise in promises.items()}
+    return summary | {"within_radius": within, "reliability": reliability}
 
 
 def _list_reliability(modes: pd.DataFrame, promise: Calibration | None) -> dict[str, list[float]]:
-    """The columns of `compute_reliability` at the radius that `Match.confidence` has by default."""
-    rows = compute_reliability(*compute_confidences(modes, RADIUS_PX, promise), modes["pair"].to_numpy())
+    """The columns of `uncertainty.compute_reliability` at the radius that `Match.confidence` has by default."""
+    confidences = uncertainty.compute_confidences(modes, RADIUS_PX, promise)
+    rows = uncertainty.compute_reliability(*confidences, modes["pair"].to_numpy())
     return {name: values.round(4).tolist() for name, values in rows.items()}
 
 
@@ -157,6 +169,38 @@ def measure_side(folder: Path) -> float:
         along = data.xy[data.labels.state.isin(PLAIN).to_numpy(), : SIDE_POINTS[data.object]]
         lengths.extend(np.linalg.norm(np.diff(along, axis=1), axis=-1).sum(1))
     return round(float(np.median(lengths)), 1)
+
+
+def read_cloth_renders(folder: Path | str) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Square pictures (s, s, 3) uint8 and their points (625, 2) px; DamagedFileError, which names what is wrong."""
+    path = Path(folder) / CLOTH_LABELS
+    labels, renders = read_json(path), []
+    for file in sorted(Path(folder).glob(CLOTH_PICTURES)):
+        image, number = read_image(file), str(int(file.name.partition("_")[0]))
+        try:
+            xy = np.array(labels[number], float).reshape(N_POINTS, 2)
+        except (KeyError, TypeError, ValueError) as error:
+            raise DamagedFileError(f"{path} must hold {N_POINTS} pixels [[x, y]] of {file.name} ({error!r})") from error
+        renders.append((image[:, : image.shape[0]], xy))
+    if len(renders) < 2:
+        raise DamagedFileError(f"{folder} must hold at least two pictures {CLOTH_PICTURES}, got {len(renders)}")
+    return renders
+
+
+def measure_cloth_renders(matcher: Matcher, folder: Path | str) -> dict[str, Any]:
+    """`mmgsd.measure.metrics.aggregate` over all queries, and the number of ``pictures``."""
+    group, renders = load_group("cloth", DEFAULT_GROUP["cloth"]), read_cloth_renders(folder)
+    points = np.arange(N_POINTS).reshape(SIDE, SIDE)[::STEP, ::STEP].ravel()
+    count = group.count_modes(points)
+    frames = []
+    for (image0, xy0), (image1, xy1) in permutations(renders, 2):
+        prepared = matcher.prepare(image0, image1)
+        for n in np.unique(count):
+            asked = points[count == n]
+            match = prepared.match(xy0[asked], n=int(n))
+            true = xy1[np.stack([group.distinct_modes(int(point)) for point in asked])]  # (S, n, 2)
+            frames.append(pd.DataFrame(compute_query_errors(match.modes, match.covariances, true)))
+    return aggregate(pd.concat(frames, ignore_index=True)) | {"pictures": len(renders)}
 
 
 class Masked:

@@ -31,10 +31,8 @@ def measure_track(xy: np.ndarray, visible: np.ndarray, truth: Truth) -> dict[str
     ``delta@1px`` … and their mean ``delta``, positions as near as that; ``swaps``, positions nearer to a like point's
     truth than to their own; ``occlusion``, points of which it is rightly said whether they are seen; ``jaccard``, the
     mean over thresholds of points rightly said to be there, of these and all errors. A position that is NaN is far from
-    all. ValueError for other shapes, or a single frame.
+    all.
     """
-    if xy.shape != truth.xy.shape or len(xy) < 2:
-        raise ValueError(f"xy must have the shape of the truth, {truth.xy.shape}, of 2 frames or more, got {xy.shape}")
     scale = RESIZED_PX / np.array(truth.size)
     own = _measure_distance(xy, truth.xy, scale)[1:]  # (T - 1, S)
     like = _measure_distance(xy[:, None], truth.likes, scale)[1:].min(1, initial=np.inf)

@@ -25,13 +25,10 @@ def compute_risk_coverage(error: np.ndarray, score: np.ndarray) -> tuple[np.ndar
     """Coverage (S,) and risk (S,): share of the queries kept, lowest score first, and the mean error of those kept.
 
     ``error`` (S,), its unit the risk's, and ``score`` (S,), high where uncertain. Queries of one score share their mean
-    error, so that the rows' order does not matter. ValueError for other shapes, or numbers not finite. Risk-coverage
-    curve of El-Yaniv and Wiener, "On the foundations of noise-free selective classification" (JMLR 2010).
+    error, so that the rows' order does not matter. Risk-coverage curve of El-Yaniv and Wiener, "On the foundations of
+    noise-free selective classification" (JMLR 2010).
     """
-    error, score = _check_pair(error, score, "error", "score")
-    for name, values in {"error": error, "score": score}.items():
-        if not np.isfinite(values).all():
-            raise ValueError(f"{name} must be finite, got {np.sum(~np.isfinite(values))} values that are not")
+    error, score = np.asarray(error, float), np.asarray(score, float)
     order = np.lexsort((error, score))
     _, tied = np.unique(score[order], return_inverse=True)
     shared = np.bincount(tied, error[order]) / np.bincount(tied)  # (scores,)
@@ -49,16 +46,11 @@ def compute_coverage(mahalanobis2: np.ndarray, levels: Sequence[float] = LEVELS)
     """Observed share (L,) of true matches within the ellipse that a Gaussian fills to each expected level (L,).
 
     ``mahalanobis2`` (M,) squared distances, one a true match. NaN, a match without an ellipse, counts as not within;
-    all are NaN where all distances are, or there are none. ValueError where a level is not in (0, 1).
+    all are NaN where all distances are, or there are none.
     """
-    distances, levels = np.asarray(mahalanobis2, float), np.asarray(levels, float)
-    if distances.ndim != 1:
-        raise ValueError(f"mahalanobis2 must have shape (M,), got {distances.shape}")
-    if not ((levels > 0) & (levels < 1)).all():
-        raise ValueError(f"levels must lie in (0, 1), got {levels.tolist()}")
-    if np.isnan(distances).all():
+    if np.isnan(mahalanobis2).all():
         return np.full(len(levels), np.nan)
-    ordered = np.sort(distances)  # NaN last
+    ordered = np.sort(mahalanobis2)  # NaN last
     return np.searchsorted(ordered, chi2.ppf(levels, 2), side="right") / len(ordered)
 
 
@@ -70,10 +62,8 @@ def compute_coverage_error(mahalanobis2: np.ndarray, levels: Sequence[float] = L
 def compute_auroc(score: np.ndarray, positive: np.ndarray) -> float:
     """Probability that a positive's score exceeds a negative's, ties a half; NaN without one of them, or of a NaN.
 
-    ``score`` (S,) and ``positive`` (S,) bool. ValueError for other shapes.
+    ``score`` (S,) and ``positive`` (S,) bool.
     """
-    score, positive = _check_pair(score, positive, "score", "positive")
-    positive = positive > 0
     if np.isnan(score).any() or len(np.unique(positive)) < 2:
         return np.nan
     return float(roc_auc_score(positive, score))
@@ -137,8 +127,7 @@ def compute_reliability(
     ``expected`` mean ``confidence`` (M,), ``observed`` share of ``near`` (M,) bool, ``margin`` half of the observed
     share's 95 % interval by pairs: modes of one ``pair`` (M,) err together. ``count`` of modes.
     """
-    confidence, near = _check_pair(confidence, near, "confidence", "near")
-    table = pd.DataFrame({"expected": confidence, "observed": near, "pair": np.asarray(pair)})
+    table = pd.DataFrame({"expected": confidence, "observed": np.asarray(near, float), "pair": np.asarray(pair)})
     table["bin"] = np.minimum((confidence * bins).astype(int), bins - 1)
     rows = table.groupby("bin")[["expected", "observed"]].mean()
     rows["count"] = table.groupby("bin").size()
@@ -206,11 +195,3 @@ def _check_lists(queries: pd.DataFrame) -> None:
     missing = [name for name in LISTS if name not in queries]
     if missing:
         raise ValueError(f"queries must have the columns {', '.join(LISTS)}, got none of {missing}: ask again")
-
-
-def _check_pair(first: np.ndarray, second: np.ndarray, *names: str) -> tuple[np.ndarray, np.ndarray]:
-    """Both as floats (S,); ValueError where they do not share that shape."""
-    first, second = np.asarray(first, float), np.asarray(second, float)
-    if first.shape != second.shape or first.ndim != 1:
-        raise ValueError(f"{' and '.join(names)} must share one shape (S,), got {first.shape} and {second.shape}")
-    return first, second

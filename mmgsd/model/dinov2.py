@@ -60,7 +60,8 @@ class VisionTransformer(nn.Module):
         """Each block's output, normalised as the last one's is."""
         patches = self.patches(x)
         grid = patches.shape[-2:]
-        tokens = (patches + self._place(grid)).flatten(2).mT  # (B, N, 384)
+        places = F.interpolate(self.positions, grid, mode="bicubic", align_corners=False)
+        tokens = (patches + places).flatten(2).mT  # (B, N, 384)
         first = (self.class_token + self.class_position).expand(len(x), -1, -1)
         tokens, tapped = torch.cat([first, tokens], 1), []
         for index, block in enumerate(self.blocks):
@@ -68,10 +69,6 @@ class VisionTransformer(nn.Module):
             if index in TAPPED:
                 tapped.append(self.norm(tokens)[:, 1:])
         return torch.cat(tapped, -1).mT.unflatten(-1, grid)
-
-    def _place(self, grid: tuple[int, int]) -> Tensor:
-        """Positions (1, 384, h, w) for a grid of patches."""
-        return F.interpolate(self.positions, grid, mode="bicubic", align_corners=False)
 
 
 def find_backbone() -> Path:

@@ -1,5 +1,5 @@
-"""What a network returns beside its descriptors, and the losses that teach it: where the object is, whether it is there
-at all, and whether a match is seen at a place or hidden.
+"""What a network returns beside its descriptors: where the object is, whether it is there at all, and whether a match
+is seen at a place or hidden.
 
 All of it is read from the descriptors' own features and learnt from labels that every data set has: masks, visibility
 of the material points, and images without the object.
@@ -18,12 +18,9 @@ from torch.nn import functional as F
 
 SURFACE = 16  # numbers that describe a place's surface to the visibility head: a fold, an edge, something in front?
 HIDDEN = 64  # units of the visibility head
-JITTER_PX = 6.0  # std by which true matches are moved before their visibility is learnt: modes are never exact
-ELSEWHERE = 2  # further places a query that are no match, and so not seen there
 BESIDE = 1 / 64  # of an image's longer side: so near to the object a pixel is taken for one on it
 LOOKED_UP = 128  # cells of the longer side that a mask is reduced to before
 ELSEWHERE_WEIGHT = 0.02  # of a heatmap's mass off the object, where the network itself says what is off it
-SHARES = {"mask": 1.0, "visibility": 0.5, "presence": 0.2}  # of the losses
 
 
 @dataclass(frozen=True)
@@ -60,7 +57,7 @@ class Heads(nn.Module):
         super().__init__()
         sizes = [width // 2, *widths]
         self.enter = nn.Conv2d(width, sizes[0], 1)
-        self.sharpen = nn.ModuleList(_conv_block(a, b) for a, b in zip(sizes, [*sizes[1:], sizes[-1]], strict=True))
+        self.sharpen = nn.ModuleList(conv_block(a, b) for a, b in zip(sizes, [*sizes[1:], sizes[-1]], strict=True))
         self.mask = nn.Conv2d(sizes[-1], 1, 1)
         self.surface = nn.Conv2d(width, SURFACE, 1)
         self.present = nn.Linear(2 * width, 1)
@@ -120,28 +117,7 @@ def look_up(mask: np.ndarray | None, logits: Tensor | None, xy: np.ndarray, size
     return found[0, 0, 0].cpu().numpy()
 
 
-def compute_mask_loss(logits: Tensor, mask: Tensor) -> Tensor:
-    """Cross-entropy of mask logits (B, hm, wm) with masks (B, h, w) in [0, 1], averaged over the logits' cells."""
-    target = F.interpolate(mask[:, None], logits.shape[-2:], mode="area")[:, 0]
-    return F.binary_cross_entropy_with_logits(logits, target)
-
-
-def compute_presence_loss(logits: Tensor, present: Tensor) -> Tensor:
-    """Cross-entropy of presence logits (B,) with (B,) bool; the few images without the object count ten times."""
-    weight = torch.where(present, 1.0, 10.0).to(logits.dtype)
-    return F.binary_cross_entropy_with_logits(logits, present.float(), weight)
-
-
-def compute_visibility_loss(logits: Tensor, seen: Tensor, counted: Tensor) -> Tensor:
-    """Cross-entropy of visibility logits (...) with ``seen`` (...) bool, over those ``counted`` (...) bool.
-
-    Seen and unseen places weigh as much as each other.
-    """
-    loss = F.binary_cross_entropy_with_logits(logits, seen.float(), reduction="none")
-    parts = [loss[counted & (seen == truth)] for truth in (True, False)]
-    return sum(part.mean() for part in parts if part.numel()) / 2 + 0 * logits.sum()
-
-
-def _conv_block(inputs: int, outputs: int) -> nn.Sequential:
-    convolution = nn.Conv2d(inputs, outputs, 3, padding=1, bias=False)
+def conv_block(inputs: int, outputs: int, *, stride: int = 1) -> nn.Sequential:
+    """A 3 x 3 convolution with batch normalisation."""
+    convolution = nn.Conv2d(inputs, outputs, 3, stride, padding=1, bias=False)
     return nn.Sequential(convolution, nn.BatchNorm2d(outputs), nn.ReLU(inplace=True))

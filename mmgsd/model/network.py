@@ -16,7 +16,7 @@ from torch.nn import functional as F
 
 from mmgsd.config import DETAILED, FROZEN, NETWORKS, PASSES
 from mmgsd.model import dinov2
-from mmgsd.model.heads import Heads, Outputs
+from mmgsd.model.heads import Heads, Outputs, conv_block
 from mmgsd.numerics import float32_layers
 
 QUIET = 0.1  # scale of what a pass adds that is put onto trained ones: their answers hardly change at first
@@ -51,12 +51,12 @@ class PyramidNetwork(nn.Module):
                 part.requires_grad_(not pretrained)
         tapped = [dinov2.WIDTH * len(dinov2.TAPPED)] * len(TAPS) if frozen else TAPS.values()
         self.lateral = nn.ModuleList(nn.Conv2d(channels, width, 1) for channels in tapped)
-        self.merge = nn.ModuleList(_conv_block(width, width) for _ in TAPS)
-        self.context = nn.Sequential(_conv_block(width, width), _conv_block(width, width))
+        self.merge = nn.ModuleList(conv_block(width, width) for _ in TAPS)
+        self.context = nn.Sequential(conv_block(width, width), conv_block(width, width))
         self.again = nn.ModuleList(PyramidPass(width) for _ in range(passes - 1))
         sizes = (3, width // 4, width // 2, width)
         self.stride = 8 if detail else 4  # of the descriptors' grid, in px of the input
-        self.detail = nn.Sequential(*(_conv_block(a, b, stride=2) for a, b in pairwise(sizes))) if detail else None
+        self.detail = nn.Sequential(*(conv_block(a, b, stride=2) for a, b in pairwise(sizes))) if detail else None
         self.head = _make_head(width, descriptor_dim, roles)
         self.heads = Heads(width, descriptor_dim, roles, sizes[2:0:-1] if detail else ()) if heads else None
         _register_normalisation(self)
@@ -70,20 +70,16 @@ class PyramidNetwork(nn.Module):
         return self
 
     def start_from(self, other: PyramidNetwork) -> None:
-        """Take the weights of a network with as many passes, or fewer, and no detail or heads where this one has none.
+        """Take the weights of a network with as many passes, or fewer, and no detail where this one has none.
 
-        ValueError for another.
+        ValueError for one with heads where this one has none.
         """
-        if len(other.again) > len(self.again):
-            raise ValueError(f"other must have at most {len(self.again) + 1} passes, got {len(other.again) + 1}")
-        if self.detail is None and other.detail is not None:
-            raise ValueError("other must have no detail, as this network has none")
         if self.heads is None and other.heads is not None:
             raise ValueError("other must have no heads, as this network has none")
         for added in self.again[len(other.again) :]:
-            torch.nn.init.constant_(added.merge[-1][1].weight, QUIET)
+            nn.init.constant_(added.merge[-1][1].weight, QUIET)
         if self.detail is not None and other.detail is None:
-            torch.nn.init.constant_(self.detail[-1][1].weight, QUIET)
+            nn.init.constant_(self.detail[-1][1].weight, QUIET)
         self.load_state_dict({**self.state_dict(), **other.state_dict()})
 
     def forward(self, image: Tensor) -> Tensor:
@@ -103,7 +99,7 @@ class PyramidNetwork(nn.Module):
                 features = self._spread(features, x.shape[-2:])
             if self.detail is not None:
                 finer = self._find_detail(x)
-                features[0] = features[0] + _resize(finer[-1], features[0])
+                features[0] = features[0] + _resize(finer[-1], features[0].shape[-2:])
             levels = self._decode(features)
             heads = self.heads(levels[-1], levels[0], finer[-2::-1]) if with_heads else ()
         return Outputs(self.head(levels[-1].float()), *heads)
@@ -119,10 +115,10 @@ class PyramidNetwork(nn.Module):
 
     def _spread(self, features: list[Tensor], size: tuple[int, int]) -> list[Tensor]:
         """Features of the second level's grid at each level's own, of images of ``size`` (height, width)."""
-        levels = [_resize_to(features[0], [side // self.stride for side in size])]
+        levels = [_resize(features[0], [side // self.stride for side in size])]
         for halvings, level in enumerate(features[1:]):
             for _ in range(halvings):  # between four cells: their mean
-                level = _resize_to(level, [(side + 1) // 2 for side in level.shape[-2:]])
+                level = _resize(level, [(side + 1) // 2 for side in level.shape[-2:]])
             levels.append(level)
         return levels
 
@@ -138,9 +134,9 @@ class PyramidNetwork(nn.Module):
 
     def _decode(self, features: list[Tensor]) -> list[Tensor]:
         """The pyramid's levels, the coarsest first."""
-        levels = [self.context(self.merge[-1](features[-1]))]  # the coarsest first
+        levels = [self.context(self.merge[-1](features[-1]))]
         for feature, merge in zip(features[-2::-1], self.merge[-2::-1], strict=True):
-            levels.append(merge(feature + _resize(levels[-1], feature)))
+            levels.append(merge(feature + _resize(levels[-1], feature.shape[-2:])))
         for again in self.again:
             levels = again(levels)
         return levels
@@ -154,17 +150,17 @@ class PyramidPass(nn.Module):
 
     def __init__(self, width: int) -> None:
         super().__init__()
-        self.down = nn.ModuleList(_conv_block(width, width, stride=2) for _ in range(len(TAPS) - 1))
-        self.merge = nn.ModuleList(_conv_block(width, width) for _ in TAPS)
+        self.down = nn.ModuleList(conv_block(width, width, stride=2) for _ in range(len(TAPS) - 1))
+        self.merge = nn.ModuleList(conv_block(width, width) for _ in TAPS)
 
     def forward(self, levels: list[Tensor]) -> list[Tensor]:
         """Levels of (B, width, h, w), the coarsest first, to as many of the same shapes."""
         passed = [levels[-1]]
         for level, down in zip(levels[-2::-1], self.down, strict=True):
-            passed.append(level + _resize(down(passed[-1]), level))
+            passed.append(level + _resize(down(passed[-1]), level.shape[-2:]))
         risen = [self.merge[0](passed[-1])]
         for level, merge in zip(passed[-2::-1], self.merge[1:], strict=True):
-            risen.append(merge(level + _resize(risen[-1], level)))
+            risen.append(merge(level + _resize(risen[-1], level.shape[-2:])))
         return [*risen[:-1], risen[-1] + levels[-1]]
 
 
@@ -177,7 +173,7 @@ class TwoRoles(nn.Module):
     def __init__(self, width: int, descriptor_dim: int) -> None:
         super().__init__()
         self.source = nn.Conv2d(width, descriptor_dim, 1)
-        self.target = nn.Sequential(_conv_block(width, width), nn.Conv2d(width, descriptor_dim, 1))
+        self.target = nn.Sequential(conv_block(width, width), nn.Conv2d(width, descriptor_dim, 1))
 
     def forward(self, x: Tensor) -> Tensor:
         """Source's channels first."""
@@ -205,7 +201,7 @@ class ResNet34Network(nn.Module):
         with torch.autocast(image.device.type, torch.bfloat16, enabled=self.reduced_precision):
             x = self.trunk((image - self.mean) / self.std)  # (B, 512, H / 8, W / 8)
         size = [side // self.stride for side in image.shape[-2:]]
-        return F.interpolate(self.head(x.float()), size, mode="bilinear", align_corners=False)
+        return _resize(self.head(x.float()), size)
 
     def describe(self, image: Tensor) -> Outputs:
         """Descriptors; this network has no heads."""
@@ -350,8 +346,6 @@ def sample_descriptors(descriptors: Tensor, xy: Tensor, size: tuple[int, int]) -
 
 def compute_squared_distances(source: Tensor, target: Tensor) -> Tensor:
     """Squared Euclidean distances of (K, Q, D) and (K, C, D) descriptors as (K, Q, C), never negative."""
-    _check_descriptors("source", source)
-    _check_descriptors("target", target)
     norms = source.square().sum(-1)[..., :, None] + target.square().sum(-1)[..., None, :]
     return torch.baddbmm(norms, source, target.mT, alpha=-2).clamp(min=0)
 
@@ -380,21 +374,7 @@ def _make_stage(inputs: int, outputs: int, blocks: int, *, stride: int = 1, dila
     return nn.Sequential(first, *(BasicBlock(outputs, outputs, 1, dilation) for _ in range(blocks - 1)))
 
 
-def _conv_block(inputs: int, outputs: int, *, stride: int = 1) -> nn.Sequential:
-    convolution = nn.Conv2d(inputs, outputs, 3, stride, padding=1, bias=False)
-    return nn.Sequential(convolution, nn.BatchNorm2d(outputs), nn.ReLU(inplace=True))
-
-
-def _check_descriptors(name: str, value: Tensor) -> None:
-    if value.ndim != 3:
-        raise ValueError(f"{name} must have shape (K, n, D), got {tuple(value.shape)}")
-
-
-def _resize(x: Tensor, like: Tensor) -> Tensor:
-    return _resize_to(x, like.shape[-2:])
-
-
-def _resize_to(x: Tensor, size: Sequence[int]) -> Tensor:
+def _resize(x: Tensor, size: Sequence[int]) -> Tensor:
     return F.interpolate(x, size, mode="bilinear", align_corners=False)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,32 +20,39 @@ FORMAT = "mmgsd-1"
 PLACES = "places"  # beside the network's tensors: what its object's material points are described as
 PICKLES = (b"PK\x03\x04", b"\x80")  # how PyTorch's own files begin
 LARGEST = {"input_px": 8192, "descriptor_dim": 4096}  # of a configuration; more would not fit a memory
-ACCEPTED = {  # what a value of the metadata must be
-    "config": "a JSON object, the training's configuration",
-    "modes": "an integer from 1 on",
-    "size": "[width, height] px",
-    "bandwidth": "a number greater than 0",
-    "temperature": "a number greater than 0",
-    "power": "a number of at least 1",
-    "sharpness": "a number of at least 1",
-    "calibration": "what `python -m mmgsd calibrate` writes, tables of numbers that ascend",
+
+
+def _at_least_one(text: str) -> float:
+    if not float(text) >= 1:
+        raise ValueError("too small")
+    return float(text)
+
+
+def _parse_json(text: str, kind: type) -> Any:
+    values = json.loads(text)
+    if not isinstance(values, kind):
+        raise ValueError(f"no {kind.__name__}")
+    return values
+
+
+METADATA = {  # what reads a value of it, and what it must be
+    "config": (lambda text: _parse_json(text, dict), "a JSON object, the training's configuration"),
+    "modes": (int, "an integer from 1 on"),
+    "size": (lambda text: tuple(_parse_json(text, list)), "[width, height] px"),
+    "bandwidth": (float, "a number greater than 0"),
+    "temperature": (float, "a number greater than 0"),
+    "power": (_at_least_one, "a number of at least 1"),
+    "sharpness": (_at_least_one, "a number of at least 1"),
+    "calibration": (parse_calibration, "what `python -m mmgsd calibrate` writes, tables of numbers that ascend"),
 }
+NEEDED = ("config", "modes", "size")  # others not every file has
 
 
-@dataclass(frozen=True)
-class Weights:
-    """What a file of weights holds."""
+def read_weights(path: Path | str) -> tuple[torch.nn.Module, TrainConfig, dict[str, Any], str]:
+    """The network, configuration, settings and object's name ("" where it does not say) of a file of a training.
 
-    network: torch.nn.Module
-    config: TrainConfig
-    settings: dict[str, Any]  # modes, size, and where they are stored `NUMBERS`, calibration and places
-    object: str  # what was taught, "" where the file does not say
-
-
-def read_weights(path: Path | str) -> Weights:
-    """Read a safetensors file that a training wrote.
-
-    FileNotFoundError, PermissionError, or ValueError, which names the file and the part of it that is wrong.
+    The settings are what the file has of `METADATA` besides the configuration, and places. FileNotFoundError,
+    PermissionError, or ValueError, which names the file and the part of it that is wrong.
     """
     path = Path(path)
     _check_file(path)
@@ -58,13 +64,11 @@ def read_weights(path: Path | str) -> Weights:
         raise ValueError(f"{path} holds no mmgsd weights: its metadata says format {metadata.get('format')!r}, "
                          f"not {FORMAT!r}")  # fmt: skip
     config, known = _read_config(path, metadata)
-    settings = {"modes": _read(path, metadata, "modes", int), "size": _read(path, metadata, "size", _parse_size)}
-    settings |= {name: _read(path, metadata, name, parse) for name, parse in NUMBERS.items() if name in metadata}
-    if "calibration" in metadata:
-        settings["calibration"] = _read(path, metadata, "calibration", parse_calibration)
+    there = [key for key in METADATA if key != "config" and key in (*NEEDED, *metadata)]
+    settings = {key: _read(path, metadata, key) for key in there}
     if PLACES in state:
-        settings["places"] = _read_places(path, state.pop(PLACES), config)
-    return Weights(_make_network(path, config, state), config, settings, config.object if known else "")
+        settings["places"] = _check_places(path, state.pop(PLACES), config)
+    return _make_network(path, config, state), config, settings, config.object if known else ""
 
 
 def _check_file(path: Path) -> None:
@@ -90,44 +94,21 @@ def _describe_damage(path: Path, error: BaseException) -> str:
     return f"{path} is truncated or no safetensors file ({error}): get it anew"
 
 
-def _read(path: Path, metadata: dict[str, str], key: str, parse: Any) -> Any:
+def _read(path: Path, metadata: dict[str, str], key: str) -> Any:
     """One value of the metadata; ValueError names the file, the key, what it says and what is accepted."""
+    parse, accepted = METADATA[key]
     if key not in metadata:
-        raise ValueError(f"{path}: its metadata lacks {key!r}, which must be {ACCEPTED[key]}: get the file anew")
+        raise ValueError(f"{path}: its metadata lacks {key!r}, which must be {accepted}: get the file anew")
     try:
         return parse(metadata[key])
     except (ValueError, TypeError, RecursionError) as error:
-        raise ValueError(f"{path}: {key!r} of its metadata must be {ACCEPTED[key]}, got {metadata[key]!r:.80}: "
+        raise ValueError(f"{path}: {key!r} of its metadata must be {accepted}, got {metadata[key]!r:.80}: "
                          "get the file anew") from error  # fmt: skip
-
-
-def _at_least_one(text: str) -> float:
-    if not float(text) >= 1:
-        raise ValueError("too small")
-    return float(text)
-
-
-# settings that not every file has
-NUMBERS = {"bandwidth": float, "temperature": float, "power": _at_least_one, "sharpness": _at_least_one}
-
-
-def _parse_size(text: str) -> tuple[int, ...]:
-    size = json.loads(text)
-    if not isinstance(size, list):
-        raise ValueError("no list")
-    return tuple(size)
-
-
-def _parse_object(text: str) -> dict[str, Any]:
-    values = json.loads(text)
-    if not isinstance(values, dict):
-        raise ValueError("no object")
-    return values
 
 
 def _read_config(path: Path, metadata: dict[str, str]) -> tuple[TrainConfig, bool]:
     """The training's configuration, and whether it names the object."""
-    values = _read(path, metadata, "config", _parse_object)
+    values = _read(path, metadata, "config")
     try:
         config = from_dict(TrainConfig, values)
         for name, largest in LARGEST.items():
@@ -138,18 +119,13 @@ def _read_config(path: Path, metadata: dict[str, str]) -> tuple[TrainConfig, boo
     return config, "object" in values
 
 
-def check_places(values: Tensor, descriptor_dim: int) -> Tensor:
+def _check_places(path: Path, values: Tensor, config: TrainConfig) -> Tensor:
     """Descriptors (P, D) as float32; ValueError for another shape or what is not finite."""
-    if values.ndim != 2 or not len(values) or values.shape[1] != descriptor_dim or not values.isfinite().all():
-        raise ValueError(f"places must be finite, (P, {descriptor_dim}), got {tuple(values.shape)}")
+    dim = config.descriptor_dim
+    if values.ndim != 2 or not len(values) or values.shape[1] != dim or not values.isfinite().all():
+        raise ValueError(f"{path} is damaged: places must be finite, (P, {dim}), got {tuple(values.shape)}: "
+                         "get the file anew")  # fmt: skip
     return values.to(torch.float32)
-
-
-def _read_places(path: Path, values: Tensor, config: TrainConfig) -> Tensor:
-    try:
-        return check_places(values, config.descriptor_dim)
-    except ValueError as error:
-        raise ValueError(f"{path} is damaged: {error}: get the file anew") from error
 
 
 def _make_network(path: Path, config: TrainConfig, state: dict[str, Tensor]) -> torch.nn.Module:

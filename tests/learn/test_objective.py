@@ -7,21 +7,30 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 
 from mmgsd.config import TrainConfig
-from mmgsd.dataset import load_dataset
-from mmgsd.learn.augmentation import load_training_images, make_batch
+from mmgsd.dataset import Dataset, load_dataset
+from mmgsd.learn.augmentation import Batch, load_training_images, make_batch
 from mmgsd.learn.objective import compute_head_loss
 from mmgsd.model.network import build_network
 
 CONFIG = TrainConfig(input_px=64, descriptor_dim=8, heads=True, clutter=True, roles=2)
 
 
-def test_the_heads_learn_and_the_judge_leaves_descriptors_alone(tiny_dataset: Callable[..., Path]) -> None:
-    data = load_dataset(tiny_dataset(), "train")
+@pytest.fixture
+def data(tiny_dataset: Callable[..., Path]) -> Dataset:
+    return load_dataset(tiny_dataset(), "train")
+
+
+@pytest.fixture
+def batch(data: Dataset, rng: np.random.Generator) -> Batch:
     images = load_training_images(data, CONFIG.input_px)
-    batch = make_batch(images, np.arange(4), CONFIG, np.random.default_rng(0), torch.device("cpu"))
+    return make_batch(images, np.arange(4), CONFIG, rng, torch.device("cpu"))
+
+
+def test_the_heads_learn_and_the_judge_leaves_descriptors_alone(data: Dataset, batch: Batch) -> None:
     torch.manual_seed(0)
     network = build_network("lite0", 8, roles=2, heads=True)
     permutations, losses = torch.tensor(data.group().permutations), []
@@ -37,10 +46,7 @@ def test_the_heads_learn_and_the_judge_leaves_descriptors_alone(tiny_dataset: Ca
     assert network.head.source.weight.grad is None
 
 
-def test_a_batch_without_any_object_has_a_finite_loss(tiny_dataset: Callable[..., Path]) -> None:
-    data = load_dataset(tiny_dataset(), "train")
-    images = load_training_images(data, CONFIG.input_px)
-    batch = make_batch(images, np.arange(4), CONFIG, np.random.default_rng(0), torch.device("cpu"))
+def test_a_batch_without_any_object_has_a_finite_loss(data: Dataset, batch: Batch) -> None:
     nothing = {name: torch.zeros_like(getattr(batch, name)) for name in ("mask", "askable", "inside")}
     network = build_network("lite0", 8, roles=2, heads=True, pretrained=False)
     empty = dataclasses.replace(batch, **nothing)

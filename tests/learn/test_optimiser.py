@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from mmgsd.config import NETWORKS, TrainConfig
-from mmgsd.learn.optimiser import ConvolutionMuon, make_optimisers
+from mmgsd.learn.training import ConvolutionMuon, make_optimisers
 from mmgsd.model.network import build_network
 
 MUON = TrainConfig(optimiser="muon", learning_rate=0.01, weight_decay=0.0)

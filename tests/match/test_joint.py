@@ -181,7 +181,7 @@ def test_fewer_joint_answers_are_the_first(data: Dataset, asked) -> None:
 @pytest.mark.parametrize("n", [0, 5, "auto", [1, 2], True])
 def test_joint_answers_are_as_many_as_the_group_has_members(n: object) -> None:
     image = np.zeros((128, 128, 3), np.uint8)
-    with pytest.raises(ValueError, match="n must be a whole number from 1 to 4 with joint, got"):
+    with pytest.raises(ValueError, match="n must be an integer from 1 to 4 with joint, got"):
         mmgsd.load("cloth").match(image, image, [(5, 5), (9, 9)], n=n, joint=True)
 
 

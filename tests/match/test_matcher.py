@@ -44,18 +44,11 @@ def test_temperature_is_a_power(bandwidth: float | None) -> None:
     torch.testing.assert_close(two, one.sqrt() / one.sqrt().sum())
 
 
-def test_entropy_of_uniform_is_log_of_its_area() -> None:
-    uniform = torch.full((2, CELLS * CELLS), 1 / CELLS**2)
-    assert compute_entropy(uniform, CELL_PX**2).tolist() == pytest.approx([np.log(485 * 485)] * 2, rel=1e-5)
-
-
-def test_entropy_of_one_cell_is_log_of_its_area() -> None:
-    assert compute_entropy(one_cell(3, 4).flatten(1), CELL_PX**2).item() == pytest.approx(2 * np.log(CELL_PX))
-
-
-def test_entropy_of_a_gaussian() -> None:
-    entropy = compute_entropy(draw_mixture(CORNERS[:1] + 140, 30.0).flatten(1), CELL_PX**2)
-    assert entropy.item() == pytest.approx(np.log(2 * np.pi * np.e * 30**2), abs=1e-3)
+def test_entropy_is_the_log_of_an_area() -> None:
+    uniform, gaussian = torch.full((1, CELLS, CELLS), 1 / CELLS**2), draw_mixture(CORNERS[:1] + 140, 30.0)
+    entropy = compute_entropy(torch.cat([uniform, one_cell(3, 4), gaussian]).flatten(1), CELL_PX**2)
+    areas = [485 * 485, CELL_PX**2, 2 * np.pi * np.e * 30**2]
+    assert entropy.tolist() == pytest.approx(np.log(areas).tolist(), abs=1e-3)
 
 
 @pytest.fixture(scope="module")
@@ -128,29 +121,16 @@ def test_modes_follow_the_targets_size(matcher: Matcher, image: np.ndarray) -> N
     np.testing.assert_allclose((two + 0.5) / 2 - 0.5, one, atol=0.5)
 
 
-@pytest.mark.parametrize("form", ["rgba", "float32", "float64"])
-def test_forms_of_one_image_give_one_answer(matcher: Matcher, image: np.ndarray, form: str) -> None:
-    alpha = np.zeros((*image.shape[:2], 1), dtype=np.uint8)
-    other = np.concatenate([image, alpha], -1) if form == "rgba" else (image / 255).astype(form)
-    one, two = (matcher.match(source, image, xy=[(50, 60)]).modes for source in (image, other))
-    np.testing.assert_array_equal(one, two)
+def test_forms_of_one_image_give_one_answer(matcher: Matcher, image: np.ndarray) -> None:
+    rgba = np.concatenate([image, np.zeros((*image.shape[:2], 1), np.uint8)], -1)
+    expected, *others = (matcher.match(source, image, xy=[(50, 60)]).modes for source in (image, rgba, image / 255))
+    for modes in others:
+        np.testing.assert_array_equal(modes, expected)
 
 
-def test_grey_is_three_equal_channels(matcher: Matcher, image: np.ndarray) -> None:
-    grey = image[..., 0]
-    one, two = (matcher.match(s, image, xy=[(50, 60)]).modes for s in (grey, np.stack([grey] * 3, -1)))
-    np.testing.assert_array_equal(one, two)
-
-
-@pytest.mark.parametrize("bad", [(160, 5), (5, 120), (-1, 5), (float("nan"), 5), (5, float("inf"))])
-def test_pixels_outside_the_source(matcher: Matcher, image: np.ndarray, bad: tuple[float, float]) -> None:
-    with pytest.raises(ValueError, match="xy must be finite and inside image0 of 160 x 120 px, got"):
-        matcher.match(image, image, xy=[(3, 3), bad])
-
-
-@pytest.mark.parametrize("bad", [(3, 4, 5), [(1, 2, 3)], 5, [[[1, 2]]]])
-def test_pixels_of_another_shape(matcher: Matcher, image: np.ndarray, bad: object) -> None:
-    with pytest.raises(ValueError, match=r"xy must be \(S, 2\) px, got shape"):
+@pytest.mark.parametrize("bad", [(160, 5), (-1, 5), (float("nan"), 5), (3, 4, 5), [[[1, 2]]]])
+def test_what_is_no_pixel_of_the_source(matcher: Matcher, image: np.ndarray, bad: object) -> None:
+    with pytest.raises(ValueError, match="^xy must be .*got"):
         matcher.match(image, image, xy=bad)
 
 
@@ -159,20 +139,11 @@ def test_no_pixel_no_answer(matcher: Matcher, image: np.ndarray) -> None:
     assert (match.modes.shape, match.entropy.shape, match.heatmap.shape) == ((0, 4, 2), (0,), (0, 120, 160))
 
 
-@pytest.mark.parametrize(
-    ("bad", "message"),
-    [
-        (np.zeros((4, 4, 2), np.uint8), r"got shape \(4, 4, 2\)"),
-        (np.zeros((0, 4, 3), np.uint8), r"got shape \(0, 4, 3\)"),
-        (np.zeros((4, 4, 3), np.int64), "must be uint8 or float, got int64"),
-        (np.full((4, 4, 3), 255.0), r"must lie in \[0, 1\], got 255.0 to 255.0"),
-        (np.full((4, 4, 3), np.nan), r"must lie in \[0, 1\], got nan"),
-    ],
-)
+@pytest.mark.parametrize("bad", [np.zeros((4, 4, 2), np.uint8), np.zeros((40, 4000, 3), np.uint8)], ids=["2", "strip"])
 @pytest.mark.parametrize("name", ["image0", "image1"])
-def test_other_images(matcher: Matcher, image: np.ndarray, name: str, bad: np.ndarray, message: str) -> None:
+def test_other_images(matcher: Matcher, image: np.ndarray, name: str, bad: np.ndarray) -> None:
     images = {"image0": image, "image1": image} | {name: bad}
-    with pytest.raises(ValueError, match=f"{name} .*{message}"):
+    with pytest.raises(ValueError, match=f"{name} .*got .*{bad.shape[0]}"):
         matcher.match(**images, xy=[(1, 1)])
 
 
@@ -246,10 +217,8 @@ def test_another_number_of_modes(matcher: Matcher, image: np.ndarray, bad: objec
 
 def test_images_keep_their_aspect(matcher: Matcher) -> None:
     shapes = [(485, 485), (364, 485), (485, 364), (970, 970), (400, 100)]
-    grids = [
-        tuple(said.descriptors.shape[1:])
-        for said in matcher.describe([np.zeros((*shape, 3), np.uint8) for shape in shapes])
-    ]
+    described = matcher.describe([np.zeros((*shape, 3), np.uint8) for shape in shapes])
+    grids = [tuple(said.descriptors.shape[1:]) for said in described]
     assert grids == [(16, 16), (14, 18), (18, 14), (16, 16), (48, 12)]
 
 
@@ -258,13 +227,6 @@ def test_images_of_several_aspects_are_described_as_each_alone(matcher: Matcher,
     for together, image in zip(matcher.describe(images), images, strict=True):
         alone = matcher.describe([image])[0].descriptors
         torch.testing.assert_close(together.descriptors, alone, atol=0.02, rtol=0.05)
-
-
-@pytest.mark.parametrize("name", ["image0", "image1"])
-def test_a_narrow_strip_is_refused(matcher: Matcher, image: np.ndarray, name: str) -> None:
-    images = {"image0": image, "image1": image} | {name: np.zeros((40, 4000, 3), np.uint8)}
-    with pytest.raises(ValueError, match=f"{name} must be at most 16 times as long as wide, got 4000 x 40 px"):
-        matcher.match(**images, xy=[(1, 1)])
 
 
 @pytest.mark.parametrize("network", NETWORKS)
@@ -392,19 +354,11 @@ def test_a_mask_of_the_callers_decides(name: str, image: np.ndarray, request: py
 
 
 @pytest.mark.parametrize("name", ["mask0", "mask1"])
-@pytest.mark.parametrize(
-    ("mask", "message"),
-    [
-        (np.ones((120, 159), bool), "must have its image's shape .120, 160., got .120, 159."),
-        (np.zeros((120, 160), bool), "must be True somewhere"),
-        (np.ones((120, 160), np.uint8), "must be bool, True on the object, got uint8"),
-        (np.ones((120, 160, 1), bool), "must have its image's shape"),
-    ],
-)
+@pytest.mark.parametrize("mask", [np.ones((120, 159), bool), np.zeros((120, 160), bool), np.ones((120, 160), np.uint8)])
 def test_a_mask_that_cannot_be_is_refused_by_name(
-    matcher: Matcher, image: np.ndarray, name: str, mask: object, message: str
+    matcher: Matcher, image: np.ndarray, name: str, mask: np.ndarray
 ) -> None:
-    with pytest.raises(ValueError, match=f"{name} {message}"):
+    with pytest.raises(ValueError, match=f"^{name} must"):
         matcher.match(image, image, xy=(5, 5), **{name: mask})
 
 

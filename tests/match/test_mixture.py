@@ -32,10 +32,9 @@ def test_separated_modes_are_found_below_a_cells_size(n: int, std_px: float) -> 
 
 
 def test_random_separated_modes(rng: np.random.Generator) -> None:
-    for _ in range(20):
-        true = CORNERS + rng.uniform(-40, 40, (4, 2))
-        fit = fit_modes(draw_mixture(true, 12.0), 4, XS, YS)
-        assert measure_errors(fit.modes[0], true).max() < 0.1
+    true = CORNERS + rng.uniform(-40, 40, (20, 4, 2))
+    fit = fit_modes(torch.cat([draw_mixture(modes, 12.0) for modes in true]), 4, XS, YS)
+    assert compute_mode_errors(fit.modes.double().numpy(), true).max() < 0.1
 
 
 def test_a_modes_position_inside_its_cell_is_found() -> None:
@@ -62,16 +61,10 @@ def test_less_of_a_prior_keeps_a_narrow_mode_out_of_a_wide_one() -> None:
     assert errors[0].max() < errors[1].max() < errors[2].max()
 
 
-@pytest.mark.parametrize("shape_prior", [0.0, -1.0, float("nan")])
-def test_another_shape_prior_is_refused(shape_prior: float) -> None:
-    with pytest.raises(ValueError, match="shape_prior must be greater than 0, got"):
-        ModeReadout(shape_prior)
-
-
-@pytest.mark.parametrize("name", ["exponent", "mean_exponent"])
-@pytest.mark.parametrize("value", [0.9, 0.0, float("nan"), float("inf")])
+@pytest.mark.parametrize("name", ["shape_prior", "exponent", "mean_exponent"])
+@pytest.mark.parametrize("value", [-1.0, 0.0, float("nan"), float("inf")])
 def test_modes_are_not_read_flatter_than_they_are(name: str, value: float) -> None:
-    with pytest.raises(ValueError, match=f"{name} must be at least 1, got"):
+    with pytest.raises(ValueError, match=f"{name} must be .*, got"):
         ModeReadout(**{name: value})
 
 
@@ -184,10 +177,8 @@ def test_covariances_are_those_of_the_full_heatmap() -> None:
 
 def test_an_oblong_mode_keeps_its_shape() -> None:
     x, y = np.meshgrid(XS.numpy() - 240, YS.numpy() - 240)
-    heatmap = torch.from_numpy(
-        np.exp(-((0.8 * x + 0.6 * y) ** 2) / (2 * 60**2) - (0.8 * y - 0.6 * x) ** 2 / (2 * 15**2))
-    )
-    covariance = fit_modes(heatmap[None], 1, XS, YS).covariances[0, 0]
+    heatmap = np.exp(-((0.8 * x + 0.6 * y) ** 2) / (2 * 60**2) - (0.8 * y - 0.6 * x) ** 2 / (2 * 15**2))
+    covariance = fit_modes(torch.from_numpy(heatmap[None]), 1, XS, YS).covariances[0, 0]
     variances, axes = torch.linalg.eigh(covariance - torch.eye(2) * CELL_PX**2 / 6)
     np.testing.assert_allclose(variances.sqrt(), [15, 60], rtol=0.02)
     np.testing.assert_allclose(axes[:, 1].abs(), [0.8, 0.6], atol=0.01)
@@ -253,17 +244,13 @@ def fit_with_scikit_learn(heatmap: Tensor, rng: np.random.Generator, samples: in
 
 
 @pytest.mark.parametrize("separation", [1.5, 2.0, 3.0])
-def test_overlapping_modes_are_found_within_half_a_cell(separation: float) -> None:
+def test_overlapping_modes_are_found_and_no_worse_than_by_scikit_learn(
+    separation: float, rng: np.random.Generator
+) -> None:
     true, heatmaps = draw_overlapping(separation)
-    assert compute_mode_errors(fit_modes(heatmaps, 2, XS, YS).modes.double().numpy(), true).mean() < CELL_PX / 2
-
-
-@pytest.mark.parametrize("separation", [1.5, 2.0, 3.0])
-def test_overlapping_modes_no_worse_than_scikit_learn(separation: float, rng: np.random.Generator) -> None:
-    true, heatmaps = draw_overlapping(separation)
-    ours = fit_modes(heatmaps, 2, XS, YS).modes.double().numpy()
+    ours = compute_mode_errors(fit_modes(heatmaps, 2, XS, YS).modes.double().numpy(), true).mean()
     theirs = np.stack([fit_with_scikit_learn(heatmap, rng) for heatmap in heatmaps])
-    assert compute_mode_errors(ours, true).mean() <= compute_mode_errors(theirs, true).mean()
+    assert ours < CELL_PX / 2 and ours <= compute_mode_errors(theirs, true).mean()
 
 
 DEGENERATE = {
@@ -325,24 +312,7 @@ def test_no_query_no_mode() -> None:
     assert (fit.modes.shape[0], fit.modes.shape[2]) == (0, 2)
 
 
-@pytest.mark.parametrize("n", [0, -1])
-def test_at_least_one_mode(n: int) -> None:
-    with pytest.raises(ValueError, match=f"n must be at least 1, got {n}"):
-        fit_modes(one_cell(3, 3), n, XS, YS)
-
-
-@pytest.mark.parametrize("shape", [(CELLS, CELLS), (1, CELLS, CELLS - 1)])
-def test_heatmap_of_another_shape(shape: tuple[int, ...]) -> None:
-    with pytest.raises(ValueError, match=r"heatmap must have shape \(S, 64, 64\), got"):
-        fit_modes(torch.ones(shape), 1, XS, YS)
-
-
-def test_number_of_modes_of_another_length() -> None:
-    with pytest.raises(ValueError, match=r"n must be one number or of shape \(1,\), got shape \(3,\)"):
-        fit_modes(one_cell(3, 3), torch.tensor([1, 2, 3]), XS, YS)
-
-
-@pytest.mark.parametrize(("n", "message"), [(2.5, "an integer, .*got torch.float32"), ("many", "'auto', got 'many'")])
-def test_another_kind_of_number(n: object, message: str) -> None:
-    with pytest.raises(ValueError, match=f"n must be .*{message}"):
+@pytest.mark.parametrize("n", [0, -1, 2.5, "many", torch.tensor([1, 2, 3])])
+def test_another_number_of_modes(n: object) -> None:
+    with pytest.raises(ValueError, match=r"n must be an integer, or \(1,\) integers, from 1 to 64, or 'auto', got"):
         fit_modes(one_cell(3, 3), n, XS, YS)

@@ -15,7 +15,7 @@ from mmgsd.dataset import Dataset, load_dataset
 from mmgsd.match.matcher import Matcher, find_weights
 from mmgsd.match.places import NAMES, lay_flat
 from mmgsd.measure.calibration import describe_places
-from mmgsd.measure.photographs import measure_by_name, read_photographs
+from mmgsd.measure.photographs import ask_by_name, read_photographs
 from mmgsd.model.tensors import read_tensors, write_tensors
 from mmgsd.symmetry import load_group
 
@@ -140,8 +140,8 @@ def test_places_are_found_from_the_command_line(
 
 def test_what_is_found_by_name_is_counted(matcher: Matcher, data: Dataset) -> None:
     photographs = read_photographs(SAMPLE / "photographs.json", data.object)
-    found = measure_by_name(matcher, photographs)
-    assert found["queries"] == len(photographs) and 0 <= found["found@5%"] <= found["found@10%"] <= 1
+    found = ask_by_name(matcher, photographs)
+    assert len(found) == len(photographs) and all(0 <= row["found@5%"][0] <= row["found@10%"][0] <= 1 for row in found)
     matcher_without = mmgsd.load(data.object)
     matcher_without.places = None
-    assert measure_by_name(matcher_without, photographs) is None
+    assert ask_by_name(matcher_without, photographs) == []

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from mmgsd.files import DamagedFileError
-from mmgsd.measure.cloth_renders import measure_cloth_renders, read_cloth_renders
+from mmgsd.measure.shipped import measure_cloth_renders, read_cloth_renders
 from mmgsd.symmetry import load_group
 
 GRID = np.stack(np.divmod(np.arange(625), 25)[::-1], 1) * 3.0 + 10  # (625, 2) px

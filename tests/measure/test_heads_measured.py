@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -77,11 +78,11 @@ def test_a_network_that_knows_has_no_error(partly_absent: Dataset, monkeypatch: 
         return {int(i): Outputs(torch.full((1, 2, 2), float(i)), mask, None, torch.tensor(float(data.present[i])))
                 for i, mask in zip(indices, masks, strict=True)}  # fmt: skip
 
-    def find_modes(_: Matcher, first: Outputs, second: Outputs, xy: torch.Tensor, *__: object, n: int) -> torch.Tensor:
+    def read_modes(_: Matcher, first: Outputs, second: Outputs, xy: torch.Tensor, *__: object) -> tuple:
         source = data.xy[int(first.descriptors.flatten()[0])]
         points = [int(np.linalg.norm(source - pixel, axis=1).argmin()) for pixel in xy.numpy()]
         orbits = data.group("c4").permutations[:, points].T[:, ::-1].copy()
-        return torch.from_numpy(data.xy[int(second.descriptors.flatten()[0])][orbits])
+        return SimpleNamespace(modes=torch.from_numpy(data.xy[int(second.descriptors.flatten()[0])][orbits])), None
 
     def see(_: Outputs, second: Outputs, xy: torch.Tensor, modes: torch.Tensor, __: object) -> torch.Tensor:
         true = data.xy[int(second.descriptors.flatten()[0])]
@@ -89,7 +90,7 @@ def test_a_network_that_knows_has_no_error(partly_absent: Dataset, monkeypatch: 
                                           for row in modes.numpy()]))  # fmt: skip
 
     monkeypatch.setattr(heads, "describe", describe)
-    monkeypatch.setattr(heads, "_find_modes", find_modes)
+    monkeypatch.setattr(heads, "read_modes", read_modes)
     monkeypatch.setattr(matcher, "compute_visible", see)
     found = measure_heads(matcher, data, CONFIG)
     assert 0.95 < found.pop("auroc_on_object") < 1  # a pixel just beside the object counts as on it

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -23,7 +22,6 @@ from mmgsd.measure.photographs import (
     describe_marks,
     digest_marks,
     make_photographs_table,
-    mark_dataset,
     measure_photographs,
     read_photographs,
     score_answer,
@@ -233,12 +231,6 @@ def test_the_samples_marks_are_those_of_its_labels(tmp_path: Path) -> None:
         (tmp_path / name).symlink_to(sample / name)
     assert write_sample_marks(tmp_path).read_bytes() == (sample / "photographs.json").read_bytes()
     assert {entry["repo"] for entry in json.loads((sample / "photographs.json").read_text())} == {"rendered"}
-
-
-def test_another_data_set_has_no_marks(tiny_dataset: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(photographs, "load_dataset", lambda *_: SimpleNamespace(object="shirt"))
-    with pytest.raises(ValueError, match="must hold a data set of one of cloth, rope, got one of 'shirt'"):
-        mark_dataset("there", "there")
 
 
 def test_the_shipped_model_is_measured_and_drawn(folder: Path) -> None:

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from mmgsd.config import TrainConfig
+from mmgsd.config import EvaluateConfig, TrainConfig
 from mmgsd.dataset import load_dataset
 from mmgsd.match.matcher import Matcher
 from mmgsd.match.mixture import ModeReadout
-from mmgsd.measure import readout
-from mmgsd.measure.readout import ALLOWED, POWERS, SHARPNESSES, Asked, Quality, choose_readout, count_seen
+from mmgsd.measure import calibration
+from mmgsd.measure.calibration import ALLOWED, POWERS, SHARPNESSES, choose_readout, count_seen
 from mmgsd.model.network import build_network
 
 
@@ -38,11 +38,11 @@ def test_only_matches_that_are_seen_count() -> None:
 def test_a_reading_that_costs_too_much_error_is_not_chosen(
     matcher: Matcher, cloth_dataset: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def measure(asked: list[Asked], tried: ModeReadout, size: tuple[int, int]) -> Quality:
+    def measure(asked: list, tried: ModeReadout, size: tuple[int, int]) -> tuple[float, float]:
         a, b = tried.exponent, tried.mean_exponent
-        return Quality(10 * (1 + 0.01 * (a - 1) * b), 0.1 * a * b, 0.0)
+        return 10 * (1 + 0.01 * (a - 1) * b), 0.1 * a * b
 
-    monkeypatch.setattr(readout, "measure_readout", measure)
+    monkeypatch.setattr(calibration, "measure_readout", measure)
     chosen = choose_readout(matcher, load_dataset(cloth_dataset, "test"), pairs=2, points=4)
     assert chosen == matcher.readout == ModeReadout(matcher.config.roundness, 1.5, 8.0)
     assert 1 + 0.01 * 0.5 * 8 <= ALLOWED < 1 + 0.01 * 8
@@ -57,7 +57,5 @@ def test_a_reading_is_chosen_by_images(matcher: Matcher, cloth_dataset: Path) ->
 
 def test_the_points_of_a_symmetrys_centre_are_not_asked(matcher: Matcher, cloth_dataset: Path) -> None:
     data = load_dataset(cloth_dataset, "test")
-    config = readout.EvaluateConfig(pairs=2, points=625)
-    for asked in readout._ask(matcher, data, config):
-        assert asked.heatmaps.shape[0] == len(asked.true) == len(asked.seen) <= 624
-        assert asked.true.shape[1:] == (4, 2)
+    for heatmaps, true, seen in calibration._ask_seen(matcher, data, EvaluateConfig(pairs=2, points=625)):
+        assert len(heatmaps) == len(true) == len(seen) <= 624 and true.shape[1:] == (4, 2)

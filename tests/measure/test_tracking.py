@@ -56,10 +56,3 @@ def test_what_has_no_like_points_cannot_swap() -> None:
 
 def test_sequences_weigh_alike_and_what_one_has_not_does_not_count() -> None:
     assert average_tracks([{"delta": 0.5}, {"delta": 1.0}, {"delta": float("nan")}]) == {"delta": 0.75}
-
-
-@pytest.mark.parametrize("frames", [1, 2])
-def test_other_shapes_are_refused(frames: int) -> None:
-    truth = make_truth(frames)
-    with pytest.raises(ValueError, match="xy must have the shape of the truth"):
-        measure_track(truth.xy[: frames - 1] if frames > 1 else truth.xy, truth.visible, truth)

@@ -10,7 +10,7 @@ import torch
 
 from mmgsd.config import TrainConfig
 from mmgsd.extras.backbones import MODEL, convert_backbone
-from mmgsd.learn.optimiser import make_optimisers
+from mmgsd.learn.training import make_optimisers
 from mmgsd.model import dinov2
 from mmgsd.model.network import build_network
 from mmgsd.paths import find_shipped

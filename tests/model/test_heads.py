@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from mmgsd.model.heads import Heads, compute_mask_loss, compute_presence_loss, compute_visibility_loss, look_up
+from mmgsd.learn.losses import compute_mask_loss, compute_presence_loss, compute_visibility_loss
+from mmgsd.model.heads import Heads, look_up
 from mmgsd.model.network import build_network
 
 

@@ -89,30 +89,21 @@ STORED = dataclasses.asdict(CONFIG)
     [
         ("config", None, "lacks 'config', which must be a JSON object"),
         ("config", "{", "'config' of its metadata must be a JSON object, .*got '{'"),
-        ("config", "[]", "'config' of its metadata must be a JSON object"),
         ("config", json.dumps({**STORED, "towel": 1}), "of 'config' in its metadata, a key of TrainConfig must be"),
         ("config", json.dumps({**STORED, "input_px": "x"}), "of 'config' in its metadata, input_px must be int"),
         ("config", json.dumps({**STORED, "input_px": 10**6}), "input_px must be at most 8192, got 1000000"),
-        ("config", json.dumps({**STORED, "descriptor_dim": 10**9}), "descriptor_dim must be at most 4096"),
         ("modes", None, "lacks 'modes', which must be an integer"),
         ("modes", "four", "'modes' of its metadata must be an integer from 1 on, got 'four'"),
         ("modes", "0", "of its metadata, modes must be an integer from 1 to 64, got 0"),
-        ("modes", "1000000", "modes must be an integer from 1 to 64, got 1000000"),
         ("size", None, r"lacks 'size', which must be \[width, height\] px"),
         ("size", "485", r"'size' of its metadata must be \[width, height\] px, got '485'"),
-        ("size", "[485", "'size' of its metadata must be"),
         ("size", "[485, -5]", "size must be .*, got .485, -5."),
-        ("size", "[1e9, 485]", "size must be"),
-        ("size", "[1, 2, 3]", "size must be"),
         ("temperature", "warm", "'temperature' of its metadata must be a number greater than 0, got 'warm'"),
         ("temperature", "nan", "temperature must be finite and greater than 0, got nan"),
-        ("temperature", "-1", "temperature must be finite and greater than 0, got -1.0"),
-        ("temperature", "inf", "temperature must be finite and greater than 0, got inf"),
         ("power", "strong", "'power' of its metadata must be a number of at least 1, got 'strong'"),
-        ("power", "0.5", "'power' of its metadata must be a number of at least 1, got '0.5'"),
         ("sharpness", "nan", "'sharpness' of its metadata must be a number of at least 1, got 'nan'"),
         ("bandwidth", "-0.5", "bandwidth must be finite and greater than 0, got -0.5"),
-        ("bandwidth", "", "'bandwidth' of its metadata must be a number"),
+        ("calibration", "{}", "'calibration' of its metadata must be what .*calibrate"),
         ("format", None, "holds no mmgsd weights: its metadata says format None"),
     ],
 )
@@ -173,13 +164,6 @@ def test_the_shipped_weights_load(name: str) -> None:
     matcher = load(name, device="cpu")
     assert matcher.object == matcher.config.object == name.split("-")[0]
     assert (find_root() / "data" / "weights" / f"{name}.safetensors").is_file()
-
-
-@pytest.mark.parametrize("value", ["{", "[]", "{}", '{"pairs": 3}', '{"other": 1}'])
-def test_a_damaged_calibration_is_named(matcher: Matcher, tmp_path: Path, value: str) -> None:
-    path = save_weights(tmp_path / "w.safetensors", matcher.network, calibration=value)
-    with pytest.raises(ValueError, match="w.safetensors: 'calibration' of its metadata must be what .*calibrate"):
-        Matcher.load(path)
 
 
 def test_a_header_that_begins_as_a_pickle_does_is_no_pickle(matcher: Matcher, tmp_path: Path) -> None:
