@@ -21,7 +21,7 @@ from PIL import Image
 from mmgsd.__main__ import main
 from mmgsd.config import TrainConfig
 from mmgsd.dataset import load_dataset
-from mmgsd.images import read_mask
+from mmgsd.images import check_mask
 from mmgsd.learn.training import train_model
 from mmgsd.match.matcher import Matcher, Pair, load
 from mmgsd.paths import find_samples
@@ -228,8 +228,8 @@ def test_a_table_may_be_printed(weights, images, capfd):
 @pytest.mark.parametrize(
     ("fill", "size", "message"),
     [
-        (255, (160, 120), "must be a mask of its image's 300 x 200 px, got 160 x 120 px"),
-        (1, SIZES[0], "must be a mask that is brighter than half on the object, got one darker everywhere"),
+        (255, (160, 120), "must have its image's shape (200, 300), got (120, 160)"),
+        (1, SIZES[0], "must be True somewhere, or brighter than half"),
     ],
 )
 def test_another_mask_is_refused(weights, images, capsys, tmp_path, fill, size, message):
@@ -257,7 +257,7 @@ def test_a_segmented_image_is_a_mask(seeing, images, capsys, tmp_path, monkeypat
     monkeypatch.setattr(Matcher, "segment", lambda *_: shown)
     out = tmp_path / "new" / "mask.png"
     assert "33% of the image" in run(capsys, "segment", images[0], "--out", out, "--weights", seeing)
-    np.testing.assert_array_equal(read_mask(out, shown.shape), shown > 0.5)
+    np.testing.assert_array_equal(check_mask(out, shown.shape, ""), shown > 0.5)
 
 
 def test_what_cannot_be_segmented_is_said(weights, images, capsys, tmp_path):
