@@ -14,8 +14,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import struct
-import zlib
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -28,9 +26,6 @@ from PIL import Image
 from mmgsd.checks import check, check_choice, describe_choices
 from mmgsd.dataset_format import REMEDY, SPLITS, DatasetError, count_points, read_info, read_labels
 from mmgsd.symmetry import SymmetryGroup
-
-UNREADABLE_IMAGE = (OSError, ValueError, TypeError, SyntaxError, LookupError, ArithmeticError, struct.error, zlib.error,
-                    Image.DecompressionBombError)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -235,7 +230,7 @@ def _open_image(path: Path, size: tuple[int, int]) -> Image.Image:
         image = Image.open(path, formats=("WEBP", "PNG"))
         if image.size == size:  # else nothing is decoded: a small file can hold a huge image
             image.load()
-    except UNREADABLE_IMAGE as error:
+    except Exception as error:  # of a damaged file Pillow raises nearly anything
         raise DatasetError(f"{path} is missing, truncated or no image: {error}: {REMEDY}") from error
     if image.size != size:
         raise DatasetError(f"{path} is {image.size[0]} x {image.size[1]} px, dataset.json says {size[0]} x {size[1]}")

@@ -39,7 +39,7 @@ def read_image(path: Path | str) -> np.ndarray:
     source = path if path.is_file() else io.BytesIO(path.read_bytes())
     if not (path.stat().st_size if source is path else source.getbuffer().nbytes):
         raise ValueError(f"{path} is empty: get the image anew")
-    return _decode(source, str(path))
+    return decode_image(source, str(path))
 
 
 def read_animation(path: Path | str) -> Iterator[np.ndarray]:
@@ -81,12 +81,8 @@ def _list_endings() -> set[str]:
     return {ending for ending, kind in known if kind in Image.OPEN and kind not in NO_PICTURES} | {".mpo", *HEIC}
 
 
-def decode_image(data: bytes, name: str) -> np.ndarray:
-    """As `read_image`, from the bytes of a file that was called ``name``."""
-    return _decode(io.BytesIO(data), name)
-
-
-def _decode(source: Path | io.BytesIO, name: str) -> np.ndarray:
+def decode_image(source: Path | io.BytesIO, name: str) -> np.ndarray:
+    """As `read_image`, from a file, or its bytes, that is called ``name``."""
     with _naming(name), Image.open(source) as image:
         return _convert(image, name)
 

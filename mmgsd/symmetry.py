@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from mmgsd.checks import check, check_choice
+from mmgsd.checks import check_choice
 from mmgsd.config import N_POINTS, OBJECTS
 
 GRID_GROUPS = ("identity", "c2", "v4", "c4", "d4")
@@ -75,9 +75,8 @@ def grid_group(name: str, *, side: int = 25) -> SymmetryGroup:
     """A symmetry group of a square cloth whose material point (r, c) has the index ``r * side + c``.
 
     ``identity``; ``c2``: turned by 180°; ``v4``: row flip, column flip, both; ``c4``: the four rotations; ``d4``: all
-    eight. Raises ValueError for any other name or a side below 2.
+    eight. Raises ValueError for any other name.
     """
-    check("side", side, "at least 2", side >= 2)
     check_choice("name of a grid's group", name, GRID_GROUPS)
     grid = np.arange(side * side).reshape(side, side)
     rotations = [np.rot90(grid, k) for k in range(4)]
@@ -92,21 +91,14 @@ def grid_group(name: str, *, side: int = 25) -> SymmetryGroup:
 
 
 def line_group(name: str, *, n: int = N_POINTS) -> SymmetryGroup:
-    """A symmetry group of a rope with n material points in order: ``identity``, or ``c2`` (end to end).
-
-    Raises ValueError for any other name or n below 2.
-    """
-    check("n", n, "at least 2", n >= 2)
+    """A symmetry group of a rope of n points in order: ``identity``, or ``c2`` (end to end); ValueError for another."""
     check_choice("name of a line's group", name, LINE_GROUPS)
     line = np.arange(n)
     return SymmetryGroup(name, np.stack([line, line[::-1]][: 2 if name == "c2" else 1]))
 
 
 def load_group(object: str, name: str) -> SymmetryGroup:
-    """The named group of one of the project's objects, ``cloth`` or ``rope``, on its 625 material points.
-
-    Raises ValueError for an unknown object or a group that the object does not have.
-    """
+    """The named group of a ``cloth`` or ``rope`` on its 625 material points; ValueError for another object or group."""
     check_choice("object", object, OBJECTS)
     check_choice(f"group of a {object}", name, GRID_GROUPS if object == "cloth" else LINE_GROUPS)
     return grid_group(name) if object == "cloth" else line_group(name)

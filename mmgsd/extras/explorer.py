@@ -239,7 +239,7 @@ class Explorer:
         if len(parts) < content["parts"]:
             self._parts[side] = parts
         else:
-            self.open_own(side, decode_image(b"".join(parts), name), name)
+            self.open_own(side, decode_image(io.BytesIO(b"".join(parts)), name), name)
 
 
 def show_scene(scene: Scene) -> dict[str, Any]:
