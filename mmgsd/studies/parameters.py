@@ -136,16 +136,11 @@ def optional(reader: Reader) -> Reader:
     return read
 
 
-def read_pixels(name: str, value: Any) -> list[list[float]]:
-    """Pixels [[column, row], …] in px, at least one; a single [column, row] is a list of one."""
+def read_pixels(name: str, value: Any) -> list:
+    """At least one pixel, as `mmgsd.images.check_pixels` takes and checks them, or text that holds such a list."""
     pixels = _to_list(value)
-    if pixels and all(_to_number(item) is not None for item in pixels):
-        pixels = [pixels]
-    pixels = [_to_list(pixel) or [] for pixel in pixels or []]
-    found = [[_to_number(item) for item in pixel] for pixel in pixels]
-    right = bool(found) and all(len(pixel) == 2 and None not in pixel for pixel in found)
-    check(name, value, "pixels [[column, row], …] of image0, such as [[235, 80]]", right)
-    return found
+    check(name, value, "pixels [[column, row], …] of image0, such as [[235, 80]]", bool(pixels))
+    return pixels
 
 
 def read_device(name: str, value: Any) -> str:
