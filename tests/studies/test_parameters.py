@@ -27,6 +27,7 @@ from mmgsd.studies.parameters import (
     optional,
     read_device,
     read_file,
+    read_flag,
     read_parameters,
     read_pixels,
     read_scheduler,
@@ -242,6 +243,8 @@ def test_a_parameter_that_is_not_set_is_named_and_none_is_changed():
 @pytest.mark.parametrize(
     ("reader", "given", "read"),
     [
+        *((read_flag, flag, True) for flag in (True, 1, "1", "true", "yes")),
+        *((read_flag, flag, False) for flag in (False, 0, "false", "False", " NO ", "off")),
         (whole(), np.int64(3), 3),
         (whole(), 8.0, 8),
         (number(), np.float32(0.5), 0.5),
@@ -277,7 +280,8 @@ NOTHING = (None, "", True, "two", [], {"a": 1}, 1e400, "1e999", float("nan"), 1j
      (listed(whole()), "[1, 2"), (listed(whole()), "[[1]]"), (listed(whole()), True), (listed(whole()), None),
      (listed(whole()), "a, b"), (listed(whole(), least=1), []), (one_of(["a"]), ["a"]), (one_of({"a": 1}), 3),
      (among([0, 26], "the points"), 25),
-     (read_pixels, []), (read_pixels, "")],
+     (read_pixels, []), (read_pixels, ""),
+     *((read_flag, value) for value in ("maybe", "", 2, None, [], "truefalse"))],
 )  # fmt: skip
 def test_what_no_reader_takes_is_a_value_error_that_names_it(reader, given):
     with pytest.raises(ValueError, match="it must be "):
