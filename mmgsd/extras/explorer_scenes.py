@@ -15,10 +15,11 @@ from mmgsd.config import OBJECTS, PRESETS, load_preset
 from mmgsd.dataset import Dataset, load_dataset, sample_pairs
 from mmgsd.images import read_image, to_rgb
 from mmgsd.match.baselines import BASELINES, BaselineMatcher
-from mmgsd.match.matcher import Matcher
+from mmgsd.match.matcher import load
 from mmgsd.model.tensors import WEIGHTS
-from mmgsd.paths import Paths, find_root, find_shipped
+from mmgsd.paths import Paths, find_root
 from mmgsd.studies.models import SHIPPED, configure_study, get_label
+from mmgsd.studies.sample import load_sample
 
 SNAP_PX = 12.0  # a click so near to a material point shows that point's true matches
 SAMPLE = "sample"  # the preset of the images in data/sample
@@ -79,9 +80,9 @@ def choose_scenes(name: str, preset: str = SAMPLE, own_images: Sequence[Path | s
     check("own_images", own_images, "[] or a list of two image files", len(own_images) in (0, 2))
     if own_images:
         return [Scene(*map(read_image, own_images), *(Path(path).name for path in own_images))]
-    root = find_root()
-    folder = root / "data" / "sample" / name if preset == SAMPLE else Paths(root, preset).dataset(name)
-    return make_scenes(load_dataset(folder, "test"))
+    if preset == SAMPLE:
+        return make_scenes(load_sample(find_root(), name))
+    return make_scenes(load_dataset(Paths(find_root(), preset).dataset(name), "test"))
 
 
 def load_matchers(name: str, preset: str = SAMPLE) -> dict[str, Any]:
@@ -89,18 +90,10 @@ def load_matchers(name: str, preset: str = SAMPLE) -> dict[str, Any]:
 
     With the preset "sample", the ones that are trained with "quick".
     """
-    check_choice("name", name, OBJECTS)
-    check_choice("preset", preset, (SAMPLE, *PRESETS))
     trained = Paths(find_root(), "quick" if preset == SAMPLE else preset)
-    matchers = load_shipped(name)
+    matchers = {get_label(method, short=True): load(f"{name}{ending}") for method, ending in SHIPPED.items()}
     for method, config in configure_study(load_preset(trained.preset), name, "main").items():
         path = trained.model(config) / WEIGHTS
         if path.is_file():
-            matchers[f"{get_label(method, short=True)} ({trained.preset})"] = Matcher.load(path)
+            matchers[f"{get_label(method, short=True)} ({trained.preset})"] = load(path)
     return matchers | {get_label(method, short=True): BaselineMatcher(method) for method in BASELINES}
-
-
-def load_shipped(name: str) -> dict[str, Matcher]:
-    """{label: matcher} of the models in data/weights that are of the object."""
-    files = {method: find_shipped() / f"{name}{ending}.safetensors" for method, ending in SHIPPED.items()}
-    return {get_label(method, short=True): Matcher.load(file) for method, file in files.items() if file.is_file()}

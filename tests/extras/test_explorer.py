@@ -19,7 +19,7 @@ import mmgsd
 from mmgsd.config import TrainConfig
 from mmgsd.dataset import load_dataset
 from mmgsd.extras.explorer import DISPLAY_PX, MOST_PINS, Explorer, prepare_baseline, show_scene
-from mmgsd.extras.explorer_scenes import Scene, choose_scenes, load_matchers, load_shipped, make_scenes
+from mmgsd.extras.explorer_scenes import Scene, choose_scenes, load_matchers, make_scenes
 from mmgsd.match.baselines import BaselineMatcher
 from mmgsd.match.describe import describe_answer
 from mmgsd.match.matcher import Matcher
@@ -298,10 +298,10 @@ def test_nothing_to_explore_is_refused() -> None:
 
 @pytest.mark.parametrize("name", ["cloth", "rope"])
 def test_every_shipped_model_of_the_object_is_offered(name: str) -> None:
-    shipped = load_shipped(name)
-    assert list(shipped) == ["MMGSD, shipped", "MMGSD", "SPCL"]
-    assert {matcher.config.object for matcher in shipped.values()} == {name}
-    assert list(load_matchers(name))[:3] == list(shipped) and "SIFT" in load_matchers(name)
+    matchers = load_matchers(name)
+    shipped = list(matchers)[:3]
+    assert shipped == ["MMGSD, shipped", "MMGSD", "SPCL"] and "SIFT" in matchers
+    assert {matchers[label].config.object for label in shipped} == {name}
 
 
 @pytest.mark.parametrize(("arguments", "message"), [
