@@ -21,7 +21,7 @@ import mmgsd
 from mmgsd.command import Option, describe_error
 from mmgsd.config import MAX_MODES, OBJECTS
 from mmgsd.files import atomic_write, write_bytes
-from mmgsd.images import check_pixels, list_images, read_mask
+from mmgsd.images import check_pixels, list_images
 from mmgsd.match.camera import read_intrinsics
 from mmgsd.match.describe import describe_answer, format_query
 from mmgsd.match.match import LIKELY
@@ -126,16 +126,16 @@ def match(
     _check_drawn(xy, "--out" if out else "--pictures" if pictures else "")
     reference, failed = mmgsd.read_image(image0), []
     check_pixels(xy, reference.shape[1::-1])
-    seen = None if mask0 is None else read_mask(mask0, reference.shape[:2])
     matcher = mmgsd.load(weights)
     matcher.compute_input_size(reference, "image0")
     if many:
         _say_left_out(image1, paths)
-    named, frames = itertools.tee(_read_readable(matcher, paths, failed) if many else _read_one(image1, mask1))
-    answers = matcher.match_many(((reference, image, xy, seen, mask) for _, image, mask in frames), n=n, joint=joint)
+    images = _read_readable(matcher, paths, failed) if many else [(image1, mmgsd.read_image(image1))]
+    named, images = itertools.tee(images)
+    answers = matcher.match_many(((reference, image, xy, mask0, mask1) for _, image in images), n=n, joint=joint)
     plain = len({path.stem.casefold() for path in paths}) == len(paths)  # a.png and a.jpg are two pictures
     with _writing_rows(csv) if csv else nullcontext() as table:
-        for (path, *_), answer in zip(named, answers, strict=True):
+        for (path, _), answer in zip(named, answers, strict=True):
             answer = answer.seen_first() if seen_first else answer
             described = describe_answer(answer)
             if table:
@@ -165,8 +165,7 @@ def find(
 ) -> None:  # fmt: skip
     """Find places of the object by name, without a first image."""
     _check_order(joint, seen_first)
-    shown = mmgsd.read_image(image)
-    answer = mmgsd.load(weights).find(shown, list(places), joint=joint, mask=mask and read_mask(mask, shown.shape[:2]))
+    answer = mmgsd.load(weights).find(mmgsd.read_image(image), list(places), joint=joint, mask=mask)
     answer = answer.seen_first() if seen_first else answer
     described = [{"place": place, **query} for place, query in zip(places, describe_answer(answer), strict=True)]
     if out:
@@ -198,8 +197,7 @@ def track(
     if video.resolve() in (path.resolve() for path in outputs):
         raise ValueError(f"--out must not be the video itself, got {out}")
     images, frames = itertools.tee(shown)
-    seen = mask0 and read_mask(mask0, next(iter(shown)).shape[:2])
-    followed = mmgsd.load(weights).follow(frames, xy, find=find, mask0=seen)
+    followed = mmgsd.load(weights).follow(frames, xy, find=find, mask0=mask0)
     absent, stopped = [], None
     written = " and ".join(map(str, outputs))
     with recording(outputs, shown.rate) as record:
@@ -300,7 +298,10 @@ def fold(
     _check_written([image], out=out)
     answer = answer_picture(mmgsd.load(weights), shown, now, look=look, chosen=chosen)
     if out:
-        draw_moves(shown.looks[look], now, answer.moves, out)
+        from mmgsd.figures.folding import plot_moves
+
+        done = shown.looks[look]
+        save_picture(plot_moves({"demonstration": (done.image, done.moves), "now": (now, answer.moves)}), out)
     told = {"pick": answer.moves[:, 0].round(1), "place": answer.moves[:, 1].round(1)}
     if intrinsics is not None:
         rays = compute_rays(answer.moves, intrinsics).round(5)
@@ -388,13 +389,6 @@ def draw_answer(answer: Any, path: Path) -> None:
     save_picture(answer.plot() if len(answer) == 1 else plot_page(answer), path)
 
 
-def draw_moves(look: Any, image: np.ndarray, moves: np.ndarray, path: Path) -> None:
-    """What a demonstration's look did, beside moves (M, 2, 2) px in an image."""
-    from mmgsd.figures.folding import plot_moves
-
-    save_picture(plot_moves({"demonstration": (look.image, look.moves), "now": (image, moves)}), path)
-
-
 def save_picture(figure: Any, path: Path) -> None:
     """A figure, as a file of the kind that its name ends with."""
     with atomic_write(path) as aside:
@@ -432,13 +426,8 @@ def _say_left_out(folder: Path, paths: list[Path]) -> None:
         print(f"left out, as they do not end as images do: {', '.join(names[:NAMED])}{more}", file=sys.stderr)
 
 
-def _read_one(path: Path, mask: Path | None) -> Iterator[tuple[Path, np.ndarray, np.ndarray | None]]:
-    image = mmgsd.read_image(path)
-    yield path, image, None if mask is None else read_mask(mask, image.shape[:2])
-
-
-def _read_readable(matcher: Any, paths: list[Path], failed: list[str]) -> Iterator[tuple[Path, np.ndarray, None]]:
-    """(path, image, no mask) of files that can be answered for; why others cannot is said, ``failed`` names them."""
+def _read_readable(matcher: Any, paths: list[Path], failed: list[str]) -> Iterator[tuple[Path, np.ndarray]]:
+    """(path, image) of files that can be answered for; why others cannot is said, ``failed`` names them."""
     bar = tqdm(paths, desc="match", unit="image", disable=not sys.stderr.isatty())
     for path in bar:
         try:
@@ -448,7 +437,7 @@ def _read_readable(matcher: Any, paths: list[Path], failed: list[str]) -> Iterat
             failed.append(path.name)
             bar.write(f"skipped: {describe_error(error)}", file=sys.stderr)
         else:
-            yield path, image, None
+            yield path, image
 
 
 def _print_answer(name: str, described: list[dict[str, Any]], *, as_json: bool) -> None:

@@ -18,7 +18,8 @@ from dask.distributed import Client, Future, LocalCluster, Security, wait
 from distributed.comm import connect
 from tqdm.auto import tqdm
 
-PATIENCE = 30.0  # s that a scheduler has to answer, and to have a worker before it is said that there is none
+ANSWER = 10.0  # s that a scheduler has to answer
+PATIENCE = 30.0  # s that it has to take a client, and to have a worker before it is said that there is none
 LOOK = 1.0  # s between two looks at the workers
 # nobody else is to reach scheduler, workers and their pages
 LOOPBACK = {"dashboard_address": "127.0.0.1:0", "worker_dashboard_address": "127.0.0.1:0", "silence_logs": "ERROR"}
@@ -26,20 +27,25 @@ LOOPBACK = {"dashboard_address": "127.0.0.1:0", "worker_dashboard_address": "127
 
 def open_client(scheduler: str) -> Client:
     """A client of the scheduler at an address; ValueError where nothing answers there as Dask does."""
+    return Client(check_scheduler("scheduler", scheduler), timeout=PATIENCE)
+
+
+def check_scheduler(name: str, address: str) -> str:
+    """The address, if a Dask scheduler answers there; ValueError, which says ``name``, where none does."""
     try:
         with ThreadPoolExecutor(1) as thread:  # in this one a notebook's own loop runs
-            thread.submit(asyncio.run, asyncio.wait_for(_greet(scheduler), PATIENCE)).result()
-        return Client(scheduler, timeout=PATIENCE)
+            thread.submit(asyncio.run, asyncio.wait_for(_greet(address), ANSWER)).result()
     except Exception as error:  # whatever it is that another program's answer does to Dask's reader
         raise ValueError(
-            f"scheduler must be the address of a Dask scheduler, got {scheduler!r}, where none answers: "
-            "take the one that `dask scheduler` prints when it starts"
+            f"{name} must be an address host:port or tcp://host:port of a Dask scheduler, got {address!r}, where none "
+            "answers: take the one that `dask scheduler` prints when it starts"
         ) from error
+    return address
 
 
-async def _greet(scheduler: str) -> None:
+async def _greet(address: str) -> None:
     """A client would wait for ever where somebody listens and says nothing."""
-    comm = await connect(scheduler, timeout=PATIENCE, **Security().get_connection_args("client"))
+    comm = await connect(address, timeout=ANSWER, **Security().get_connection_args("client"))
     comm.abort()
 
 

@@ -14,21 +14,18 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import struct
-import zlib
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pandas as pd
 from PIL import Image
 
+from mmgsd.checks import check, check_choice, describe_choices
 from mmgsd.dataset_format import REMEDY, SPLITS, DatasetError, count_points, read_info, read_labels
 from mmgsd.symmetry import SymmetryGroup
-
-UNREADABLE_IMAGE = (OSError, ValueError, TypeError, SyntaxError, LookupError, ArithmeticError, struct.error, zlib.error,
-                    Image.DecompressionBombError)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -97,16 +94,14 @@ class Dataset:
     def group(self, name: str = "") -> SymmetryGroup:
         """The stored symmetry group of that name ("" is the object's own); ValueError names those stored."""
         name, stored = name or self.info["default_group"], self.info["symmetry"]
-        if name not in stored:
-            raise ValueError(f"group must be one of {', '.join(map(repr, stored))} for this data set, got {name!r}")
+        check("group", name, f"{describe_choices(name, stored)} for this data set", name in stored)
         return SymmetryGroup(name, np.asarray(stored[name]))
 
     @property
     def mirror(self) -> np.ndarray | None:
         """Where each material point (P,) goes in a mirror image, None for an object that has no mirror image."""
-        if self.info.get("mirror") is None:
-            return None
-        return np.asarray(self.info["mirror"])
+        mirror = self.info.get("mirror")
+        return None if mirror is None else np.asarray(mirror)
 
     def load_image(self, index: int) -> np.ndarray:
         """(H, W, 3) uint8; DatasetError where the file is missing, truncated or of another size."""
@@ -124,8 +119,7 @@ def load_dataset(folder: Path | str, split: str = "train") -> Dataset:
     DatasetError (which names the file) for one that is damaged. ``check_dataset`` also decodes every image.
     """
     folder = Path(folder)
-    if split not in SPLITS:
-        raise ValueError(f"split must be one of {SPLITS}, got {split!r}")
+    check_choice("split", split, SPLITS)
     info = read_info(folder / "dataset.json")
     if split not in info["images"]:
         raise ValueError(f"{folder} has no {split} images: render them as well (without only_test)")
@@ -141,13 +135,12 @@ def check_dataset(folder: Path | str) -> pd.DataFrame:
 
     Raises DatasetError at the first violation, with the file's name.
     """
-    rows, info = [], read_info(Path(folder) / "dataset.json")
-    splits = {split: load_dataset(folder, split) for split in SPLITS if split in info["images"]}
+    rows, described = [], read_info(Path(folder) / "dataset.json")["images"]
+    splits = {split: load_dataset(folder, split) for split in SPLITS if split in described}
     for split, data in splits.items():
         for index in range(len(data)):
             data.load_image(index)
-            mask = data.load_mask(index)
-            _check_labels_on_mask(data, index, mask)
+            _check_labels_on_mask(data, index, data.load_mask(index))
         rows.append({"split": split, "images": len(data), "visible points": round(float(data.visible.mean()), 3)})
     train, test = (set(splits[split].episode) if split in splits else set() for split in SPLITS)
     if train & test:
@@ -155,10 +148,10 @@ def check_dataset(folder: Path | str) -> pd.DataFrame:
     return pd.DataFrame(rows).set_index("split")
 
 
-def hold_out(data: Dataset, *, share: float = 0.05) -> tuple[Dataset, Dataset]:
-    """The split without its last simulations, and these: ``share`` of them, at least one; all in both if only one."""
+def hold_out(data: Dataset) -> tuple[Dataset, Dataset]:
+    """The split without its last simulations, and these: a twentieth, at least one; all in both if only one."""
     episodes = np.unique(data.episode)
-    last = episodes[-max(1, round(share * len(episodes))) :]
+    last = episodes[-max(1, round(len(episodes) * 0.05)) :]
     held = data.labels.episode.isin(last)
     if held.all():
         return data, data
@@ -214,17 +207,16 @@ def measure_images(data: Dataset) -> pd.DataFrame:
 
 
 def sample_pairs(
-    episode: np.ndarray, n_pairs: int, rng: np.random.Generator, *, same_episode: bool = False,
-    present: np.ndarray | None = None,
-) -> np.ndarray:  # fmt: skip
-    """Draw ``n_pairs`` ordered pairs of different images, of different simulations unless ``same_episode``.
+    episode: np.ndarray, n_pairs: int, rng: np.random.Generator, *, present: np.ndarray | None = None
+) -> np.ndarray:
+    """Draw ``n_pairs`` ordered pairs of different images, of different simulations where there are several.
 
     Only of images that are ``present`` (N,) bool, where that is given: those that show the object. Returns (n_pairs, 2)
     int; without repetition while the images suffice. ValueError where no pair exists.
     """
     able = np.ones(len(episode), dtype=bool) if present is None else np.asarray(present, dtype=bool)
     first, second = np.nonzero(~np.eye(len(episode), dtype=bool) & able & able[:, None])
-    if not same_episode and len(np.unique(episode)) > 1:
+    if len(np.unique(episode)) > 1:
         keep = episode[first] != episode[second]
         first, second = first[keep], second[keep]
     if len(first) == 0:
@@ -238,7 +230,7 @@ def _open_image(path: Path, size: tuple[int, int]) -> Image.Image:
         image = Image.open(path, formats=("WEBP", "PNG"))
         if image.size == size:  # else nothing is decoded: a small file can hold a huge image
             image.load()
-    except UNREADABLE_IMAGE as error:
+    except Exception as error:  # of a damaged file Pillow raises nearly anything
         raise DatasetError(f"{path} is missing, truncated or no image: {error}: {REMEDY}") from error
     if image.size != size:
         raise DatasetError(f"{path} is {image.size[0]} x {image.size[1]} px, dataset.json says {size[0]} x {size[1]}")
@@ -256,9 +248,8 @@ def _check_labels_on_mask(data: Dataset, index: int, mask: np.ndarray) -> None:
     if not visible.any():
         raise DatasetError(f"{data.folder / name}: no material point is visible")
     column, row = np.rint(xy[visible]).astype(int).T
-    if column.min() < 0 or row.min() < 0 or column.max() >= width or row.max() >= height:
+    if not ((column >= 0) & (column < width) & (row >= 0) & (row < height)).all():
         raise DatasetError(f"{data.folder / 'labels.parquet'}: a visible point of {name} lies outside the image")
-    padded = np.pad(mask, 2)
-    near = np.any([padded[row + dy, column + dx] for dy in range(5) for dx in range(5)], axis=0)
+    near = cv2.dilate(mask.astype(np.uint8), np.ones((5, 5), np.uint8))[row, column] > 0
     if near.mean() < 0.98:
         raise DatasetError(f"{data.folder / name}: {np.sum(~near)} of {near.size} visible points lie off the mask")

@@ -28,7 +28,7 @@ IMAGE, MASK = (re.compile(rf"{place}/(?!\.)[A-Za-z0-9_.-]+\.{ending}") for place
                (("images", "webp"), ("masks", "png")))  # fmt: skip
 RENDERED = re.compile(r"(images/(train|test)_\d+_\d+\.webp)|(masks/(train|test)_\d+_\d+\.png)")
 NAME, GROUP = re.compile("[a-z][a-z0-9_-]{0,63}"), re.compile("[A-Za-z][A-Za-z0-9_]{0,31}")
-WORDS, DIGEST = re.compile(r"[A-Za-z0-9][A-Za-z0-9 _.,+()-]{0,99}"), re.compile("[0-9a-f]{64}")
+WORDS, DIGEST = re.compile(r"([A-Za-z0-9][A-Za-z0-9 _.,+()-]{0,99})?"), re.compile("[0-9a-f]{64}")
 UNREADABLE = (OSError, ValueError, TypeError, LookupError, ArithmeticError, NotImplementedError, MemoryError,
               AttributeError, pa.ArrowException)  # fmt: skip  # what pandas raises about a damaged table
 
@@ -68,14 +68,11 @@ def read_labels(path: Path, info: dict[str, Any]) -> pd.DataFrame:
     """The table labels.parquet, tested against its description; DatasetError names the column."""
     try:
         data = path.read_bytes()
-    except OSError as error:
-        raise DatasetError(f"{path} is missing, truncated or no Parquet table: {error}: {REMEDY}") from error
-    if "labels_sha256" in info and hashlib.sha256(data).hexdigest() != info["labels_sha256"]:
-        raise DatasetError(f"{path} is damaged: its SHA-256 is not the labels_sha256 of dataset.json: {REMEDY}")
-    try:
+        if info.get("labels_sha256") not in (None, hashlib.sha256(data).hexdigest()):
+            raise ValueError("its SHA-256 is not the labels_sha256 of dataset.json")
         labels = pd.read_parquet(io.BytesIO(data))
     except UNREADABLE as error:
-        raise DatasetError(f"{path} is missing, truncated or no Parquet table: {error}: {REMEDY}") from error
+        raise DatasetError(f"{path} is missing, damaged or no Parquet table: {error}: {REMEDY}") from error
     missing = [name for name in REQUIRED_COLUMNS if name not in labels]
     if missing:
         raise DatasetError(f"{path} lacks the columns {missing}")
@@ -155,9 +152,8 @@ def _check_words(path: Path, labels: pd.DataFrame) -> None:
         if pd.api.types.is_numeric_dtype(labels[column]) or column in ("xy", "visible", "intrinsics", "camera_pose"):
             continue
         pattern = patterns.get(column, WORDS)
-        wrong = [v for v in labels[column] if not (isinstance(v, str) and pattern.fullmatch(v))]
-        if column not in patterns:  # what no thing lies about has none to name
-            wrong = [value for value in wrong if value != "" and not _is_missing(value)]
+        given = labels[column] if column in patterns else labels[column].astype(object).fillna("")
+        wrong = [value for value in given if not _is_text(value, pattern)]
         if wrong:
             raise DatasetError(f"{path}: {column} must be like {pattern.pattern}, got {_shorten(wrong[0])}: {REMEDY}")
     for column in patterns:
@@ -180,10 +176,6 @@ def _check_numbers(path: Path, labels: pd.DataFrame, points: int) -> None:
             raise DatasetError(f"{path}: {column} holds values that are not finite")
 
 
-def _is_missing(value: Any) -> bool:
-    return value is None or (isinstance(value, float) and np.isnan(value)) or value is pd.NA
-
-
 def _is_integer(value: Any, least: int, most: float = np.inf) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and least <= value <= most
 
@@ -193,32 +185,23 @@ def _is_text(value: Any, pattern: re.Pattern[str]) -> bool:
 
 
 def _is_permutation(value: Any) -> bool:
-    if not isinstance(value, list) or not value or not all(type(v) is int for v in value):
-        return False
-    return sorted(value) == list(range(len(value)))
+    integers = isinstance(value, list) and value and all(type(v) is int for v in value)
+    return bool(integers) and sorted(value) == list(range(len(value)))
 
 
-def _are_groups(value: Any) -> bool:
-    if not isinstance(value, dict) or not value or not all(_is_text(name, GROUP) for name in value):
-        return False
-    return all(isinstance(rows, list) and rows and all(map(_is_permutation, rows)) for rows in value.values())
+def _are_permutations(value: Any) -> bool:
+    return isinstance(value, list) and bool(value) and all(map(_is_permutation, value))
+
+
+def _is_table(value: Any, is_key: Callable[[Any], bool], is_value: Callable[[Any], bool]) -> bool:
+    return isinstance(value, dict) and all(is_key(key) and is_value(item) for key, item in value.items())
 
 
 def _is_config(value: Any) -> bool:
     try:
-        return isinstance(value, dict) and bool(from_dict(RenderConfig, value))
+        return bool(from_dict(RenderConfig, value))
     except (ValueError, TypeError):
         return False
-
-
-def _is_count(value: Any) -> bool:
-    return isinstance(value, dict) and bool(value) and all(k in SPLITS and _is_integer(value[k], 1) for k in value)
-
-
-def _are_versions(value: Any) -> bool:
-    if not isinstance(value, dict) or not all(_is_text(name, NAME) for name in value):
-        return False
-    return all(_is_integer(version, 0) or _is_text(version, WORDS) for version in value.values())
 
 
 def _shorten(value: Any) -> str:
@@ -232,15 +215,24 @@ DESCRIBED: dict[str, tuple[str, Callable[[Any], bool]]] = {  # key: what is acce
         f"[width, height], each 1 to {LARGEST} px",
         lambda v: isinstance(v, list) and len(v) == 2 and all(_is_integer(side, 1, LARGEST) for side in v),
     ),
-    "symmetry": ("permutations of the points 0, 1, … by the names of their groups", _are_groups),
+    "symmetry": (
+        "permutations of the points 0, 1, … by the names of their groups",
+        lambda v: v and _is_table(v, lambda name: _is_text(name, GROUP), _are_permutations),
+    ),
     "default_group": ("a group's name", lambda v: _is_text(v, GROUP)),
     "config": ("what RenderConfig accepts", _is_config),
-    "images": (f"the number of images of one or more of {SPLITS}", _is_count),
-    "versions": ("version numbers by the names of packages", _are_versions),
+    "images": (
+        f"the number of images of one or more of {SPLITS}",
+        lambda v: v and _is_table(v, lambda split: split in SPLITS, lambda count: _is_integer(count, 1)),
+    ),
+    "versions": (
+        "version numbers by the names of packages",
+        lambda v: _is_table(v, lambda name: _is_text(name, NAME), lambda n: _is_integer(n, 0) or _is_text(n, WORDS)),
+    ),
     "mirror": ("null, or each of the points 0, 1, … once", lambda v: v is None or _is_permutation(v)),
     "packed": (
         '{"quality": 1 to 100}',
-        lambda v: isinstance(v, dict) and set(v) == {"quality"} and _is_integer(v["quality"], 1, 100),
+        lambda v: v and _is_table(v, lambda key: key == "quality", lambda quality: _is_integer(quality, 1, 100)),
     ),
     "labels_sha256": ("64 hexadecimal digits", lambda v: _is_text(v, DIGEST)),
 }

@@ -293,10 +293,8 @@ def _is_running(host: str, pid: int) -> bool:
         return True
     try:
         os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
+    except OSError as error:  # of another user's process PermissionError
+        return not isinstance(error, ProcessLookupError)
     return True
 
 

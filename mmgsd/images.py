@@ -39,7 +39,7 @@ def read_image(path: Path | str) -> np.ndarray:
     source = path if path.is_file() else io.BytesIO(path.read_bytes())
     if not (path.stat().st_size if source is path else source.getbuffer().nbytes):
         raise ValueError(f"{path} is empty: get the image anew")
-    return _decode(source, str(path))
+    return decode_image(source, str(path))
 
 
 def read_animation(path: Path | str) -> Iterator[np.ndarray]:
@@ -57,26 +57,12 @@ def find_beside(path: Path, name: str) -> Path:
     return place if place.exists() else path.parent / name.replace("\\", "/")
 
 
-def read_mask(path: Path | str, shape: tuple[int, int]) -> np.ndarray:
-    """(H, W) bool of a mask's file, True where it is brighter than half, for an image of that ``shape``.
-
-    ValueError, which names the file, for one of another size or without any object, and as `read_image`.
-    """
-    mask = read_image(path).mean(-1) > WHITE / 2
-    if mask.shape != tuple(shape):
-        (height, width), (rows, columns) = shape, mask.shape
-        raise ValueError(f"{path} must be a mask of its image's {width} x {height} px, got {columns} x {rows} px")
-    if not mask.any():
-        raise ValueError(f"{path} must be a mask that is brighter than half on the object, got one darker everywhere")
-    return mask
-
-
 def list_images(folder: Path | str) -> list[Path]:
     """The image files of a folder, by their names' endings, in the order of their names; ValueError where it has none.
 
     The endings are those of all kinds that `read_image` reads. Hidden files and folders in it are left out.
     """
-    paths = sorted(path for path in Path(folder).iterdir() if path.suffix.lower() in _list_endings())
+    paths = sorted(path for path in Path(folder).iterdir() if is_image(path))
     found = [path for path in paths if path.is_file() and not path.name.startswith(".")]
     if not found:
         raise ValueError(f"{folder} holds no image: its files must end as images do, with .png, .jpg, .webp, .tif …")
@@ -95,12 +81,8 @@ def _list_endings() -> set[str]:
     return {ending for ending, kind in known if kind in Image.OPEN and kind not in NO_PICTURES} | {".mpo", *HEIC}
 
 
-def decode_image(data: bytes, name: str) -> np.ndarray:
-    """As `read_image`, from the bytes of a file that was called ``name``."""
-    return _decode(io.BytesIO(data), name)
-
-
-def _decode(source: Path | io.BytesIO, name: str) -> np.ndarray:
+def decode_image(source: Path | io.BytesIO, name: str) -> np.ndarray:
+    """As `read_image`, from a file, or its bytes, that is called ``name``."""
     with _naming(name), Image.open(source) as image:
         return _convert(image, name)
 
@@ -201,19 +183,19 @@ def check_pixels(xy: Any, size: tuple[int, int], *, image: str = "image0") -> np
 
 
 def check_mask(mask: Any, shape: tuple[int, int], name: str) -> np.ndarray:
-    """A copy of a mask (H, W) bool of an image of that ``shape``; ValueError for another, or where it is all False.
+    """A copy of a mask (H, W) bool of an image of that ``shape``, or of a path's file what is brighter than half.
 
-    A path's file is read as by `read_mask`.
+    ValueError, which says ``name`` or the path, for another mask, or where it is all False; of a path as `read_image`.
     """
     if isinstance(mask, str | os.PathLike):
-        return read_mask(mask, shape)
+        mask, name = read_image(mask).mean(-1) > WHITE / 2, str(mask)
     values = _to_array(mask, name)
     if values.dtype != bool:
         raise ValueError(f"{name} must be bool, True on the object, got {values.dtype}: compare it, as in mask > 127")
     if values.shape != tuple(shape):
         raise ValueError(f"{name} must have its image's shape {tuple(shape)}, got {values.shape}")
     if not values.any():
-        raise ValueError(f"{name} must be True somewhere, got a mask without any object")
+        raise ValueError(f"{name} must be True somewhere, or brighter than half, got a mask without any object")
     return np.array(values)
 
 

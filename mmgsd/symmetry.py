@@ -7,10 +7,12 @@ kind of object brings a new array and no new code.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from typing import Any
 
 import numpy as np
 
+from mmgsd.checks import check_choice
 from mmgsd.config import N_POINTS, OBJECTS
 
 GRID_GROUPS = ("identity", "c2", "v4", "c4", "d4")
@@ -65,25 +67,17 @@ class SymmetryGroup:
         return 1 + (np.diff(members, axis=-1) != 0).sum(axis=-1)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON: ``name`` and ``permutations`` as G lists of P integers."""
+        """Plain values for JSON, of which ``SymmetryGroup(**values)`` is the group again."""
         return {"name": self.name, "permutations": self.permutations.tolist()}
-
-    @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> SymmetryGroup:
-        """Rebuild a group from :meth:`to_dict`'s values; ValueError for other keys or where an axiom fails."""
-        if set(values) != {"name", "permutations"}:
-            raise ValueError(f"values must have the keys 'name' and 'permutations', got {sorted(values)}")
-        return cls(values["name"], _from_lists(values["permutations"]))
 
 
 def grid_group(name: str, *, side: int = 25) -> SymmetryGroup:
     """A symmetry group of a square cloth whose material point (r, c) has the index ``r * side + c``.
 
     ``identity``; ``c2``: turned by 180°; ``v4``: row flip, column flip, both; ``c4``: the four rotations; ``d4``: all
-    eight. Raises ValueError for any other name or a side below 2.
+    eight. Raises ValueError for any other name.
     """
-    if side < 2:
-        raise ValueError(f"side must be at least 2, got {side!r}")
+    check_choice("name of a grid's group", name, GRID_GROUPS)
     grid = np.arange(side * side).reshape(side, side)
     rotations = [np.rot90(grid, k) for k in range(4)]
     elements = {
@@ -93,29 +87,20 @@ def grid_group(name: str, *, side: int = 25) -> SymmetryGroup:
         "c4": rotations,
         "d4": [*rotations, *(rotation[::-1] for rotation in rotations)],
     }
-    _check_name("name of a grid's group", name, GRID_GROUPS)
     return SymmetryGroup(name, np.stack([element.ravel() for element in elements[name]]))
 
 
 def line_group(name: str, *, n: int = N_POINTS) -> SymmetryGroup:
-    """A symmetry group of a rope with n material points in order: ``identity``, or ``c2`` (end to end).
-
-    Raises ValueError for any other name or n below 2.
-    """
-    if n < 2:
-        raise ValueError(f"n must be at least 2, got {n!r}")
-    _check_name("name of a line's group", name, LINE_GROUPS)
+    """A symmetry group of a rope of n points in order: ``identity``, or ``c2`` (end to end); ValueError for another."""
+    check_choice("name of a line's group", name, LINE_GROUPS)
     line = np.arange(n)
     return SymmetryGroup(name, np.stack([line, line[::-1]][: 2 if name == "c2" else 1]))
 
 
 def load_group(object: str, name: str) -> SymmetryGroup:
-    """The named group of one of the project's objects, ``cloth`` or ``rope``, on its 625 material points.
-
-    Raises ValueError for an unknown object or a group that the object does not have.
-    """
-    _check_name("object", object, OBJECTS)
-    _check_name(f"group of a {object}", name, GRID_GROUPS if object == "cloth" else LINE_GROUPS)
+    """The named group of a ``cloth`` or ``rope`` on its 625 material points; ValueError for another object or group."""
+    check_choice("object", object, OBJECTS)
+    check_choice(f"group of a {object}", name, GRID_GROUPS if object == "cloth" else LINE_GROUPS)
     return grid_group(name) if object == "cloth" else line_group(name)
 
 
@@ -125,15 +110,10 @@ def load_mirror(object: str) -> np.ndarray:
     No symmetry of one shape: the mirror image of a cloth shows another cloth, whose columns count backwards; that of a
     rope another rope, its points in the same order. ValueError for an unknown object.
     """
-    _check_name("object", object, OBJECTS)
+    check_choice("object", object, OBJECTS)
     points = np.arange(N_POINTS)
     side = round(N_POINTS**0.5)
     return points.reshape(side, side)[:, ::-1].ravel() if object == "cloth" else points
-
-
-def _check_name(argument: str, value: str, accepted: tuple[str, ...]) -> None:
-    if value not in accepted:
-        raise ValueError(f"{argument} must be one of {', '.join(map(repr, accepted))}, got {value!r}")
 
 
 def _as_integers(argument: str, values: Any) -> np.ndarray:
@@ -143,19 +123,13 @@ def _as_integers(argument: str, values: Any) -> np.ndarray:
     return array.astype(np.int64)
 
 
-def _from_lists(rows: list[list[int]]) -> np.ndarray:
-    if len({len(row) for row in rows}) != 1:
-        raise ValueError(f"permutations must be rows of one length, got lengths {[len(row) for row in rows]}")
-    return _as_integers("permutations", rows)
-
-
 def _check_rows(permutations: np.ndarray) -> None:
     if permutations.ndim != 2 or 0 in permutations.shape:
         raise ValueError(f"permutations must be a (G, P) array with G, P >= 1, got the shape {permutations.shape}")
     points = np.arange(permutations.shape[1])
-    for index, row in enumerate(permutations):
-        if not np.array_equal(np.sort(row), points):
-            raise ValueError(f"permutations must hold each of 0 to {len(points) - 1} once a row; row {index} does not")
+    wrong = np.flatnonzero((np.sort(permutations, axis=1) != points).any(axis=1))
+    if len(wrong):
+        raise ValueError(f"permutations must hold each of 0 to {len(points) - 1} once a row; row {wrong[0]} does not")
 
 
 def _check_closed(permutations: np.ndarray) -> None:
@@ -165,7 +139,6 @@ def _check_closed(permutations: np.ndarray) -> None:
         raise ValueError(f"permutations must be {len(permutations)} different rows, got {len(rows)}")
     if np.arange(permutations.shape[1]).tobytes() not in rows:
         raise ValueError("permutations must contain the identity, got none")
-    for i, first in enumerate(permutations):
-        for j, second in enumerate(permutations):
-            if first[second].tobytes() not in rows:
-                raise ValueError(f"permutations must be closed under composition: row {i} after row {j} is not a row")
+    for (i, first), (j, second) in itertools.product(enumerate(permutations), repeat=2):
+        if first[second].tobytes() not in rows:
+            raise ValueError(f"permutations must be closed under composition: row {i} after row {j} is not a row")

@@ -91,25 +91,18 @@ def writing_video(path: Path, rate: float) -> Iterator[Callable[[np.ndarray], No
     check_choice("ending of a video that is written", path.suffix.lower(), tuple(CODECS))
     path.parent.mkdir(parents=True, exist_ok=True)
     with scratch_folder(path.parent, path.name) as folder:
-        inside, writers = folder / f"video{path.suffix.lower()}", []
+        inside, writer = folder / f"video{path.suffix.lower()}", cv2.VideoWriter()
+        kind = cv2.VideoWriter_fourcc(*CODECS[inside.suffix])
 
         def write(frame: np.ndarray) -> None:
-            if not writers:
-                writers.append(_open_writer(inside, rate, frame.shape[1::-1]))
-            writers[0].write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
+            if not (writer.isOpened() or writer.open(str(inside), cv2.CAP_FFMPEG, kind, rate, frame.shape[1::-1])):
+                raise RuntimeError(f"this OpenCV cannot write {path.suffix} videos: choose another of {[*CODECS]}")
+            writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
 
         try:
             yield write
         finally:
-            for writer in writers:
-                writer.release()
-        if writers:
+            writer.release()
+        if inside.exists():
             with atomic_write(path) as aside:
                 os.replace(inside, aside)
-
-
-def _open_writer(path: Path, rate: float, size: tuple[int, int]) -> cv2.VideoWriter:
-    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*CODECS[path.suffix]), rate, size)
-    if not writer.isOpened():
-        raise RuntimeError(f"this OpenCV cannot write {path.suffix} videos: choose another of {', '.join(CODECS)}")
-    return writer

@@ -28,7 +28,7 @@ def submit(client: Client, count: int = 2) -> list:
 
 @pytest.mark.parametrize("greeting", [b"SSH-2.0-OpenSSH_9.2p1\r\n", b"HTTP/1.1 400 Bad Request\r\n\r\n", b"", None])
 def test_a_port_that_is_not_dasks_is_named_in_time(monkeypatch: pytest.MonkeyPatch, greeting: bytes | None) -> None:
-    monkeypatch.setattr(cluster, "PATIENCE", 1.0)
+    monkeypatch.setattr(cluster, "ANSWER", 1.0)
     with socket.create_server(("127.0.0.1", 0)) as server:
         address, asked = f"tcp://127.0.0.1:{server.getsockname()[1]}", []
 
@@ -38,7 +38,7 @@ def test_a_port_that_is_not_dasks_is_named_in_time(monkeypatch: pytest.MonkeyPat
             asked[0].sendall(greeting)
 
         threading.Thread(target=answer, daemon=True).start() if greeting is not None else server.close()
-        with pytest.raises(ValueError, match=f"scheduler must be .*{address}"):
+        with pytest.raises(ValueError, match=f"^scheduler must be .*{address}"):
             open_client(address)
 
 

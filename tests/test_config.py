@@ -3,19 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 
 import pytest
 
-from mmgsd.config import (
-    OBJECTS,
-    EvaluateConfig,
-    RenderConfig,
-    TrainConfig,
-    digest,
-    from_dict,
-    load_preset,
-    to_dict,
-)
+from mmgsd.config import OBJECTS, EvaluateConfig, RenderConfig, TrainConfig, digest, from_dict, load_preset, to_dict
 
 OTHER = {  # another accepted value for the fields that are no plain numbers or flags
     "object": "cloth", "method": "pcl", "group": "identity", "network": "lite0", "trunk_weights": "w.safetensors",
@@ -47,8 +39,6 @@ def test_what_is_stored_of_a_plain_scene_is_what_was_stored_before_there_was_ano
     ]  # fmt: skip
     assert from_dict(RenderConfig, stored) == RenderConfig(object="rope")
     assert to_dict(RenderConfig(scene="workspace"))["scene"] == "workspace"
-    with pytest.raises(ValueError, match="scene must be one of 'plain', 'workspace'.*got 'workspaces'"):
-        RenderConfig(scene="workspaces")
 
 
 def test_paper_preset_has_the_papers_sizes() -> None:
@@ -65,50 +55,38 @@ def test_unknown_preset_names_the_accepted_ones() -> None:
         load_preset("papr")
 
 
-@pytest.mark.parametrize(
-    ("kind", "values", "message"),
-    [
-        (TrainConfig, {"sigma_px": -1.0}, "sigma_px must be greater than 0, got -1.0"),
-        (TrainConfig, {"sigma_px": 0}, "sigma_px must be greater than 0"),
-        (TrainConfig, {"sigma_px": float("nan")}, "sigma_px must be a finite float, got nan"),
-        (TrainConfig, {"margin": float("inf")}, "margin must be a finite float, got inf"),
-        (TrainConfig, {"weight_decay": -0.1}, "weight_decay must be at least 0"),
-        (TrainConfig, {"steps": "200"}, "steps must be int, got '200'"),
-        (TrainConfig, {"steps": 2.5}, "steps must be int, got 2.5"),
-        (TrainConfig, {"steps": True}, "steps must be int, got True"),
-        (TrainConfig, {"steps": 0}, "steps must be at least 1, got 0"),
-        (TrainConfig, {"augment": 1}, "augment must be bool, got 1"),
-        (TrainConfig, {"batch": 1}, "batch must be at least 2"),
-        (TrainConfig, {"non_matches": 1}, "non_matches must be at least 2"),
-        (TrainConfig, {"input_px": 32}, "input_px must be at least 64 for 'lite0', got 32"),
-        (TrainConfig, {"input_px": 96, "network": "lite0x2fine"}, "input_px must be at least 128 for 'lite0x2fine'"),
-        (TrainConfig, {"roundness": 0.0}, "roundness must be greater than 0, got 0.0"),
-        (TrainConfig, {"seed": -1}, "seed must be at least 0, got -1"),
-        (TrainConfig, {"method": "mmgds"}, "method must be one of 'pcl', .*did you mean 'mmgsd'.*got 'mmgds'"),
-        (
-            TrainConfig,
-            {"network": "vgg"},
-            "network must be one of .*'lite0'.*'resnet34', got 'vgg'",
-        ),
-        (TrainConfig, {"optimiser": "adam"}, "optimiser must be one of 'adamw', 'muon' .did you mean 'adamw'"),
-        (TrainConfig, {"schedule": "none"}, "schedule must be one of 'cosine', 'step'"),
-        (RenderConfig, {"train_images": 0}, "train_images must be at least 1"),
-        (RenderConfig, {"rotation_deg": 181.0}, r"rotation_deg must be in \(0, 180\], got 181"),
-        (RenderConfig, {"ball": True}, "ball must be False for a cloth, got True"),
-        (TrainConfig, {"bend": 0.6}, r"bend must be in \[0, 0.5\], got 0.6"),
-        (TrainConfig, {"groups": 5}, "groups must be a divisor of batch and pairs"),
-        (TrainConfig, {"groups": 16, "pairs": 64}, "at least 2 of 16 images"),
-        (TrainConfig, {"prototype_weight": -0.5}, "prototype_weight must be at least 0, or -1"),
-        (RenderConfig, {"object": "../towel"}, "the name of a file in data/objects"),
-        (RenderConfig, {"seed": -1}, "seed must be at least 0, got -1"),
-        (EvaluateConfig, {"points": 626}, "points must be between 1 and 625, got 626"),
-        (EvaluateConfig, {"pairs": 0}, "pairs must be at least 1"),
-        (EvaluateConfig, {"seed": -1}, "seed must be at least 0, got -1"),
-    ],
-)
-def test_wrong_value_names_argument_and_what_is_accepted(kind: type, values: dict, message: str) -> None:
+@pytest.mark.parametrize(("kind", "name", "value", "accepted"), [
+    (TrainConfig, "sigma_px", -1.0, "greater than 0"), (TrainConfig, "sigma_px", 0, "greater than 0"),
+    (TrainConfig, "sigma_px", float("nan"), "a finite float"), (TrainConfig, "margin", float("inf"), "a finite float"),
+    (TrainConfig, "weight_decay", -0.1, "at least 0"), (TrainConfig, "steps", "200", "int"),
+    (TrainConfig, "steps", 2.5, "int"), (TrainConfig, "steps", True, "int"), (TrainConfig, "steps", 0, "at least 1"),
+    (TrainConfig, "augment", 1, "bool"), (TrainConfig, "batch", 1, "at least 2"),
+    (TrainConfig, "non_matches", 1, "at least 2"), (TrainConfig, "input_px", 32, "at least 64 for 'lite0'"),
+    (TrainConfig, "roundness", 0.0, "greater than 0"), (TrainConfig, "seed", -1, "at least 0"),
+    (TrainConfig, "method", "mmgds", "one of 'pcl', .*did you mean 'mmgsd'"),
+    (TrainConfig, "network", "vgg", "one of .*'lite0'.*'resnet34'"),
+    (TrainConfig, "optimiser", "adam", "one of 'adamw', 'muon'"), (TrainConfig, "schedule", "none", "one of 'cosine'"),
+    (TrainConfig, "bend", 0.6, r"in \[0, 0.5\]"), (TrainConfig, "groups", 5, "a divisor of batch and pairs"),
+    (TrainConfig, "prototype_weight", -0.5, "at least 0, or -1"), (RenderConfig, "train_images", 0, "at least 1"),
+    (RenderConfig, "rotation_deg", 181.0, r"in \(0, 180\]"),
+    (RenderConfig, "ball", True, "False for a cloth"), (RenderConfig, "seed", -1, "at least 0"),
+    (RenderConfig, "object", "../towel", "'cloth', 'rope' or the name of a file in data/objects"),
+    (RenderConfig, "scene", "workspaces", "one of 'plain', 'workspace'"),
+    (EvaluateConfig, "points", 626, "between 1 and 625"), (EvaluateConfig, "pairs", 0, "at least 1"),
+    (EvaluateConfig, "seed", -1, "at least 0"),
+])  # fmt: skip
+def test_wrong_value_names_argument_and_what_is_accepted(kind: type, name: str, value: object, accepted: str) -> None:
+    with pytest.raises(ValueError, match=rf"{name} must be {accepted}.*, got {re.escape(repr(value))}"):
+        kind(**{name: value})
+
+
+@pytest.mark.parametrize(("values", "message"), [
+    ({"input_px": 96, "network": "lite0x2fine"}, "input_px must be at least 128 for 'lite0x2fine'"),
+    ({"groups": 16, "pairs": 64}, "groups must be .* at least 2 of 16 images"),
+])  # fmt: skip
+def test_values_must_fit_together(values: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        kind(**values)
+        TrainConfig(**values)
 
 
 @pytest.mark.parametrize("kind", [RenderConfig, TrainConfig])

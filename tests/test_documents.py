@@ -9,13 +9,11 @@ import subprocess
 from pathlib import Path
 
 import nbformat
-import numpy as np
 import pandas as pd
 import pytest
 import tomllib
 
 from mmgsd.__main__ import COMMANDS, _list_studies, make_parser
-from mmgsd.dataset import load_dataset
 from mmgsd.report.tables import update_tables
 from mmgsd.studies.registry import list_studies
 
@@ -217,12 +215,3 @@ def test_what_notebooks_show_is_shown_as_what_it_is(path: Path) -> None:
         assert "Empty DataFrame" not in data.get("text/plain", ""), "an empty table"
         if "the explorer" in data.get("text/plain", ""):
             assert "image/jpeg" in data, "a page that runs nothing shows nothing"
-
-
-def test_an_image_without_the_object_has_no_overlap_with_it() -> None:
-    cells = nbformat.read(ROOT / "notebooks" / "12_other_pictures.ipynb", 4).cells
-    (shown,) = (output.data["text/plain"] for cell in cells for output in cell.get("outputs", [])
-                if "mask IoU" in output.get("data", {}).get("text/plain", ""))  # fmt: skip
-    overlap = [float(line.split()[1]) for line in shown.splitlines()[1:]]
-    present = load_dataset(ROOT / "data" / "sample" / "workspace" / "cloth", "test").present
-    assert np.isfinite(overlap).tolist() == present.tolist()

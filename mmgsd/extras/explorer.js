@@ -307,29 +307,22 @@ class Explorer {
 
   makeTable({ xy, modes, entropy, outside, said }, k) {
     const dot = () => make("span", { className: "mmgsd-dot", style: `background: ${COLOURS[k % COLOURS.length]}` });
-    const row = (kind, cells) => make("tr", {}, ...cells.map((cell) => make(kind, {}, ...[cell].flat())));
-    const percent = (value) => `${(100 * value).toFixed(0)} %`;
     const bar = (value) => make("span", { className: "mmgsd-share" }, make("i", { style: `width: ${100 * value}%` }));
-    const share = (value) => [bar(value), percent(value)];
-    const rows = modes.map((mode, m) => {
-      const [x, y] = mode.xy.map((value) => value.toFixed(1));
-      const spread = `± ${mode.spread_px.toFixed(0)} px`;
-      const seen = mode.visible === undefined ? [] : [`${isHidden(mode) ? "hidden" : "seen"}, ${percent(mode.visible)}`];
-      const node = row("td", [[dot(), `${mode.answer ?? m + 1}`], x, y, share(mode.weight), spread, share(mode.confidence), ...seen]);
-      const light = (lit) => () => {
-        this.lit = lit;
-        this.draw();
-      };
-      return Object.assign(node, { onmouseenter: light([k, m]), onmouseleave: light(null) });
-    });
     const place = xy.map((value) => value.toFixed(0)).join(", ");
     const rest = ` at (${place}) · entropy ${entropy.toFixed(1)} nats · ${percent(outside)} outside the modes`;
-    const known = modes[0]?.visible === undefined ? [] : ["seen there"];
-    const head = row("th", ["mode", "x px", "y px", "weight", "spread", "confidence", ...known]);
-    head.children[5].title = "How probable a true match within 20 px is";
     const why = said ? [make("div", { className: "mmgsd-why", textContent: said })] : [];
-    return make("table", {}, make("caption", {}, dot(), make("b", { textContent: `Point ${k + 1}` }), rest, ...why),
-      make("thead", {}, head), make("tbody", {}, ...rows));
+    const caption = [dot(), make("b", { textContent: `Point ${k + 1}` }), rest, ...why];
+    const table = makeModes("mode", modes, caption, (value) => [bar(value), percent(value)]);
+    table.tHead.rows[0].cells[5].title = "How probable a true match within 20 px is";
+    const light = (lit) => () => {
+      this.lit = lit;
+      this.draw();
+    };
+    [...table.tBodies[0].rows].forEach((row, m) => {
+      row.cells[0].prepend(dot());
+      Object.assign(row, { onmouseenter: light([k, m]), onmouseleave: light(null) });
+    });
+    return table;
   }
 
   savePicture() {
@@ -363,8 +356,6 @@ class Explorer {
     download(new Blob([marks, "\n"], { type: "application/json" }), "index.json");
   }
 }
-
-const isHidden = ({ visible }) => visible < 0.5; // where it is known
 
 function makeLegend(colours) {
   const bar = make("canvas", { width: 64, height: 10, style: "border-radius: 2px" });

@@ -24,6 +24,7 @@ import cv2
 import numpy as np
 import traitlets
 
+from mmgsd.checks import check_choice
 from mmgsd.extras.explorer_scenes import Scene
 from mmgsd.figures.plots import plot_samples
 from mmgsd.figures.style import FADED, HEAT, compute_ellipse, compute_strength, fade_image
@@ -119,36 +120,20 @@ class Explorer:
             self._mark()
         return answer
 
-    @property
-    def method(self) -> str:
-        """The name of the matcher that answers; setting it answers anew, and leaves all as it was where that fails."""
-        return self.pictures.method
+    def choose(self, name: str, value: Any) -> None:
+        """Answer all points anew with the trait ``method`` or ``together`` changed, or raise and leave all as it was.
 
-    @method.setter
-    def method(self, name: str) -> None:
-        """Answer all points by the matcher of that name, or raise and leave all as it was."""
-        if name not in self.matchers:
-            raise ValueError(f"method must be one of {', '.join(map(repr, self.matchers))}, got {name!r}")
-        before, self.pictures.method = self.pictures.method, name
+        ``method`` is the name of the matcher that answers; ``together``: whether it answers all points together
+        (`Matcher.match`, ``joint``).
+        """
+        if name == "method":
+            check_choice(name, value, self.matchers)
+        before = getattr(self.pictures, name)
+        setattr(self.pictures, name, value)
         try:
             self._answer(self.points)
         except Exception:
-            self.pictures.method = before
-            raise
-
-    @property
-    def together(self) -> bool:
-        """Whether all points are answered together (`Matcher.match`, ``joint``); setting it is as setting `method`."""
-        return self.pictures.together
-
-    @together.setter
-    def together(self, on: bool) -> None:
-        """Answer all points anew, or raise and leave all as it was."""
-        before, self.pictures.together = self.pictures.together, bool(on)
-        try:
-            self._answer(self.points)
-        except Exception:
-            self.pictures.together = before
+            setattr(self.pictures, name, before)
             raise
 
     @property
@@ -164,7 +149,7 @@ class Explorer:
 
     def _mark(self) -> None:
         """Take what is pinned for the marked places of the left image; they stay when another is opened."""
-        file, kind = self.scene.name0, getattr(self.matchers[self.method], "object", "")
+        file, kind = self.scene.name0, getattr(self.matchers[self.pictures.method], "object", "")
         self.marks.pop(file, None)
         if self.pins:
             self.marks[file] = describe_marks(file, self.pins, kind)
@@ -194,15 +179,15 @@ class Explorer:
 
     def _check_together(self) -> bool:
         """Whether all points are to be answered together; ValueError, in the page's words, where the method cannot."""
-        matcher = self.matchers[self.method]
-        if self.together and (isinstance(matcher, FeatureMatcher) or not matcher.config.heads):
-            raise ValueError(f"together must be off for {get_label(self.method, short=True)}, which has not learnt "
-                             "where the object is: choose another method")  # fmt: skip
-        return self.together
+        name, matcher = self.pictures.method, self.matchers[self.pictures.method]
+        if self.pictures.together and (isinstance(matcher, FeatureMatcher) or not matcher.config.heads):
+            raise ValueError(f"together must be off for {get_label(name, short=True)}, which has not learnt where the "
+                             "object is: choose another method")  # fmt: skip
+        return self.pictures.together
 
     def _get_answering(self) -> Callable[..., Match]:
         """The chosen method, its descriptors of this pair computed once."""
-        name = self.method
+        name = self.pictures.method
         if name not in self._prepared:
             matcher, scene = self.matchers[name], self.scene
             baseline = isinstance(matcher, FeatureMatcher)
@@ -231,9 +216,9 @@ class Explorer:
         elif do == "step":
             self._step(content["to"])
         elif do == "method":
-            self.method = content["name"]
+            self.choose("method", content["name"])
         elif do == "together":
-            self.together = content["on"]
+            self.choose("together", bool(content["on"]))
         elif do == "clear":
             self.clear()
         elif do == "file":
@@ -254,7 +239,7 @@ class Explorer:
         if len(parts) < content["parts"]:
             self._parts[side] = parts
         else:
-            self.open_own(side, decode_image(b"".join(parts), name), name)
+            self.open_own(side, decode_image(io.BytesIO(b"".join(parts)), name), name)
 
 
 def show_scene(scene: Scene) -> dict[str, Any]:

@@ -18,6 +18,23 @@ function download(blob, name) {
 const decode = (bytes) => createImageBitmap(new Blob([bytes], { type: "image/jpeg" }));
 const toBytes = (view) => new Uint8Array(view.buffer, view.byteOffset, view.byteLength);
 
+// ---- tables of modes
+
+const percent = (value) => `${(100 * value).toFixed(0)} %`;
+const isHidden = ({ visible }) => visible < 0.5; // where it is known
+
+// A row a mode, the first column headed by `word`; `share` makes the content of a cell from a share.
+function makeModes(word, modes, caption, share = percent) {
+  const row = (kind, cells) => make("tr", {}, ...cells.map((cell) => make(kind, {}, ...[cell].flat())));
+  const tell = (mode, m) => [mode.answer ?? m + 1, ...mode.xy.map((value) => value.toFixed(1)), share(mode.weight),
+    `± ${mode.spread_px.toFixed(0)} px`, share(mode.confidence),
+    ...(mode.visible === undefined ? [] : [`${isHidden(mode) ? "hidden" : "seen"}, ${percent(mode.visible)}`])];
+  const known = modes[0]?.visible === undefined ? [] : ["seen there"];
+  const head = row("th", [word, "x px", "y px", "weight", "spread", "confidence", ...known]);
+  return make("table", {}, make("caption", {}, ...caption), make("thead", {}, head),
+    make("tbody", {}, ...modes.map((mode, m) => row("td", tell(mode, m)))));
+}
+
 // ---- drawing: `place` says where image pixels go, {scale, x, y}; `unit` is the thickness of a line
 
 function drawImage(context, place, bitmap, [width, height], smooth = false) {

@@ -10,16 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from mmgsd.checks import check_choice
+from mmgsd.checks import check, check_choice
 from mmgsd.config import OBJECTS, PRESETS, load_preset
 from mmgsd.dataset import Dataset, load_dataset, sample_pairs
-from mmgsd.images import decode_image, to_rgb
+from mmgsd.images import read_image, to_rgb
 from mmgsd.match.baselines import BASELINES, BaselineMatcher
-from mmgsd.match.matcher import Matcher
+from mmgsd.match.matcher import load
 from mmgsd.model.tensors import WEIGHTS
-from mmgsd.paths import Paths, find_root, find_shipped
+from mmgsd.paths import Paths, find_root
 from mmgsd.studies.models import SHIPPED, configure_study, get_label
-from mmgsd.studies.parameters import find_file
+from mmgsd.studies.sample import load_sample
 
 SNAP_PX = 12.0  # a click so near to a material point shows that point's true matches
 SAMPLE = "sample"  # the preset of the images in data/sample
@@ -70,20 +70,19 @@ def make_scenes(data: Dataset, *, pairs: int = 50, seed: int = 0) -> list[Callab
 
 
 def choose_scenes(name: str, preset: str = SAMPLE, own_images: Sequence[Path | str] = ()) -> list:
-    """The pairs to open for an object: two image files where ``own_images`` names them, else test images of a data set.
+    """The pairs to open for an object: two image files where ``own_images`` are these, else test images of a data set.
 
     ``preset``: "sample" for the images that come with the repository, or a preset whose data set has been rendered.
-    Relative paths are those of `find_file`. ValueError names the argument that is wrong.
+    ValueError names the argument that is wrong.
     """
     check_choice("name", name, OBJECTS)
     check_choice("preset", preset, (SAMPLE, *PRESETS))
-    if isinstance(own_images, str | bytes) or not isinstance(own_images, Sequence) or len(own_images) not in (0, 2):
-        raise ValueError(f"own_images must be [] or a list of two image files, got {own_images!r}")
+    check("own_images", own_images, "[] or a list of two image files", len(own_images) in (0, 2))
     if own_images:
-        files = [find_file(path, f"own_images[{k}]") for k, path in enumerate(own_images)]
-        images = [decode_image(file.read_bytes(), file.name) for file in files]
-        return [Scene(*images, *(file.name for file in files))]
-    return make_scenes(load_dataset(_find_dataset(name, preset), "test"))
+        return [Scene(*map(read_image, own_images), *(Path(path).name for path in own_images))]
+    if preset == SAMPLE:
+        return make_scenes(load_sample(find_root(), name))
+    return make_scenes(load_dataset(Paths(find_root(), preset).dataset(name), "test"))
 
 
 def load_matchers(name: str, preset: str = SAMPLE) -> dict[str, Any]:
@@ -91,23 +90,10 @@ def load_matchers(name: str, preset: str = SAMPLE) -> dict[str, Any]:
 
     With the preset "sample", the ones that are trained with "quick".
     """
-    check_choice("name", name, OBJECTS)
-    check_choice("preset", preset, (SAMPLE, *PRESETS))
     trained = Paths(find_root(), "quick" if preset == SAMPLE else preset)
-    matchers = load_shipped(name)
+    matchers = {get_label(method, short=True): load(f"{name}{ending}") for method, ending in SHIPPED.items()}
     for method, config in configure_study(load_preset(trained.preset), name, "main").items():
         path = trained.model(config) / WEIGHTS
         if path.is_file():
-            matchers[f"{get_label(method, short=True)} ({trained.preset})"] = Matcher.load(path)
+            matchers[f"{get_label(method, short=True)} ({trained.preset})"] = load(path)
     return matchers | {get_label(method, short=True): BaselineMatcher(method) for method in BASELINES}
-
-
-def load_shipped(name: str) -> dict[str, Matcher]:
-    """{label: matcher} of the models in data/weights that are of the object."""
-    files = {method: find_shipped() / f"{name}{ending}.safetensors" for method, ending in SHIPPED.items()}
-    return {get_label(method, short=True): Matcher.load(file) for method, file in files.items() if file.is_file()}
-
-
-def _find_dataset(name: str, preset: str) -> Path:
-    root = find_root()
-    return root / "data" / "sample" / name if preset == SAMPLE else Paths(root, preset).dataset(name)

@@ -20,6 +20,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from mmgsd.checks import check
 from mmgsd.command import Option
 from mmgsd.config import OBJECTS, load_preset
 from mmgsd.dataset import Dataset, check_dataset, load_dataset
@@ -38,7 +39,7 @@ def write_sample(folder: Path, out: Path, *, quality: int = WEBP_QUALITY) -> Pat
 
     ForeignFileError where ``out`` holds anything but a data set, LockedError while another process works on it.
     """
-    quality = _read_quality(quality)
+    check("quality", quality, "between 1 and 100", 1 <= quality <= 100)
     splits = [_thin(load_dataset(folder, split), count) for split, count in SAMPLE.items()]
     with locked(out, "sampling"):
         if out.exists() or out.is_symlink():
@@ -84,12 +85,6 @@ def _encode_labels(labels: pd.DataFrame, size: tuple[int, int]) -> bytes:
     pq.write_table(table, buffer, compression="zstd", compression_level=19, use_dictionary=plain,
                    use_byte_stream_split=["xy.list.element"])  # fmt: skip
     return buffer.getvalue()
-
-
-def _read_quality(quality: int) -> int:
-    if not isinstance(quality, int) or isinstance(quality, bool) or not 1 <= quality <= 100:
-        raise ValueError(f"quality must be between 1 and 100, got {quality!r}")
-    return quality
 
 
 def main(

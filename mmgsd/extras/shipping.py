@@ -22,7 +22,7 @@ from mmgsd.measure.shipped import SETS
 from mmgsd.model.tensors import WEIGHTS, load_metadata, read_config, read_tensors, write_tensors
 from mmgsd.paths import Paths, find_root
 from mmgsd.studies.models import SHIPPED, configure_model
-from mmgsd.studies.parameters import check_stored
+from mmgsd.studies.parameters import check_made
 from mmgsd.studies.shipped import RESULTS
 
 CARD = """# {title}
@@ -144,7 +144,7 @@ def main(
             if file.is_file():
                 print(restore_model(file, paths.model(models[key]), models[key]))
         return
-    check_stored(paths, "04_evaluate", "rmse.json")
+    check_made(paths, "04_evaluate with run=True", [paths.results / "rmse.json"])
     for (name, method), model in models.items():
         weights, measured = paths.model(model) / WEIGHTS, _find_measured(paths, name, method)
         if not weights.is_file() or not (measured or method == "shipped"):  # these are measured as they are shipped

@@ -12,7 +12,6 @@ import json
 import math
 import numbers
 import re
-import socket
 from collections.abc import Callable, Collection, Iterable, Mapping, MutableMapping
 from pathlib import Path
 from typing import Any
@@ -23,8 +22,6 @@ from mmgsd.paths import Paths, find_root, find_shipped
 from mmgsd.studies.models import list_rows
 
 Reader = Callable[[str, Any], Any]
-ADDRESS = re.compile(r"((tcp|tls|ws|wss|ucx)://)?(?P<host>\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+):(?P<port>[0-9]{1,5})")
-SECONDS = 5.0  # that a scheduler has to answer
 INJECTED = "# Parameters"  # how the cell begins that papermill puts after the one tagged ``parameters``
 
 
@@ -51,11 +48,6 @@ def check_made(paths: Paths, by: str, files: Iterable[Path], **told: str) -> Non
         if not file.exists():
             place = file.relative_to(paths.root) if file.is_relative_to(paths.root) else file
             raise ValueError(f"for {same} there is no {place} yet: run {by} for it first")
-
-
-def check_stored(paths: Paths, notebook: str, *names: str) -> None:
-    """ValueError where the preset has no results of one of these names yet; ``notebook`` makes them, if it is to."""
-    check_made(paths, f"{notebook} with run=True", [paths.results / name for name in names])
 
 
 def check_images(paths: Paths, objects: Iterable[str], *, split: str = "test") -> None:
@@ -87,14 +79,8 @@ def one_of(choices: Collection[str]) -> Reader:
     return read
 
 
-def read_preset(name: str, value: Any) -> str:
-    """The name of a preset."""
-    return one_of(PRESETS)(name, value)
-
-
-def read_method(name: str, value: Any) -> str:
-    """The name of a model of the main table, which has the same in every preset."""
-    return one_of([row.name for row in list_rows("main")])(name, value)
+read_preset = one_of(PRESETS)
+read_method = one_of([row.name for row in list_rows("main")])  # the main table has the same models in every preset
 
 
 def among(values: Collection[int], whose: str) -> Reader:
@@ -150,50 +136,36 @@ def optional(reader: Reader) -> Reader:
     return read
 
 
-def read_pixels(name: str, value: Any) -> list[list[float]]:
-    """Pixels [[column, row], …] in px, at least one; a single [column, row] is a list of one."""
+def read_pixels(name: str, value: Any) -> list:
+    """At least one pixel, as `mmgsd.images.check_pixels` takes and checks them, or text that holds such a list."""
     pixels = _to_list(value)
-    if pixels and all(_to_number(item) is not None for item in pixels):
-        pixels = [pixels]
-    pixels = [_to_list(pixel) or [] for pixel in pixels or []]
-    found = [[_to_number(item) for item in pixel] for pixel in pixels]
-    right = bool(found) and all(len(pixel) == 2 and None not in pixel for pixel in found)
-    check(name, value, "pixels [[column, row], …] of image0, such as [[235, 80]]", right)
-    return found
+    check(name, value, "pixels [[column, row], …] of image0, such as [[235, 80]]", bool(pixels))
+    return pixels
 
 
 def read_device(name: str, value: Any) -> str:
     """What torch computes on: "" for the GPU where there is one, "cpu", "cuda", or the GPU of a number, "cuda:1"."""
-    import torch  # not in every notebook that reads parameters
+    from mmgsd.model.network import find_device  # with torch: not in every notebook that reads parameters
 
-    gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
-    names = ["", "cpu", *(["cuda", *(f"cuda:{i}" for i in range(gpus))] if gpus else [])]
-    value = "" if value is None else value
-    check(name, value, describe_choices(value, names) + ("" if gpus else ": torch finds no GPU here"), value in names)
-    return value
+    return "" if value is None or value == "" else find_device(value)
 
 
 def read_scheduler(name: str, value: Any) -> str:
     """The address of a Dask scheduler that answers, host:port or tcp://host:port; "" (or None) for none."""
     if value is None or value == "":
         return ""
-    found = ADDRESS.fullmatch(value) if isinstance(value, str) else None
-    right = found is not None and 0 < int(found["port"]) < 65536
-    check(name, value, 'an address host:port or tcp://host:port, or "" for none', right)
-    try:
-        socket.create_connection((found["host"].strip("[]"), int(found["port"])), timeout=SECONDS).close()
-    except OSError as error:
-        raise ValueError(f"{name} must be the address of a scheduler that runs, got {value!r}: {error}") from error
-    return value
+    from mmgsd.cluster import check_scheduler
+
+    return check_scheduler(name, value)
 
 
 def read_weights(name: str, value: Any) -> str:
-    """Trained weights: the name of a model in data/weights, or a safetensors file (see `find_file`)."""
+    """Trained weights: the name of a model in data/weights, or a safetensors file (see `read_file`)."""
     shipped = sorted(path.stem for path in find_shipped().glob("*.safetensors"))
     if value in shipped:
         return value
     try:
-        found = find_file(value, name)
+        found = read_file(name, value)
     except ValueError as error:
         raise ValueError(f"{error}; or {describe_choices(value, shipped)}") from error
     return str(value) if Path(value).is_file() else str(found)  # a model's name depends on how its start was written
@@ -205,25 +177,20 @@ def read_object(name: str, value: Any) -> str:
 
 
 def read_file(name: str, value: Any) -> Path:
-    """An existing file (see `find_file`)."""
-    return find_file(value, name)
-
-
-def find_file(path: Path | str, name: str = "path") -> Path:
-    """An existing file, by one rule wherever a path is asked for; ValueError, which says ``name``, where it is none.
+    """An existing file, by one rule wherever a path is asked for.
 
     A relative path is looked for from where the notebook or the command was started, then from the repository's root;
     ``~`` is the home folder.
     """
-    if not isinstance(path, str | Path) or not str(path).strip():
-        raise ValueError(f"{name} must be the path of a file, got {path!r}")
-    given = Path(path).expanduser()
+    if not isinstance(value, str | Path) or not str(value).strip():
+        raise ValueError(f"{name} must be the path of a file, got {value!r}")
+    given = Path(value).expanduser()
     places = dict.fromkeys(place / given for place in (Path.cwd(), find_root()))  # an absolute path stays as it is
     for place in places:
         if place.is_file():
             return place
     looked = " or ".join(map(str, places))
-    raise ValueError(f"{name} must be the path of a file that exists, got {str(path)!r}: there is no file {looked}")
+    raise ValueError(f"{name} must be the path of a file that exists, got {str(value)!r}: there is no file {looked}")
 
 
 def _list_assigned(cell: str, known: Mapping[str, Any]) -> list[str]:

@@ -213,7 +213,9 @@ class Page {
 
   draw() {
     this.pictures.forEach((picture, side) => picture.draw((...how) => this.images[side] && this.paint(side, ...how)));
-    this.tables.replaceChildren(...(this.answer ? [this.makeTable(this.answer)] : []));
+    const { xy, modes } = this.answer ?? {};
+    const caption = () => `Pixel (${xy.map((value) => value.toFixed(0)).join(", ")})`;
+    this.tables.replaceChildren(...(this.answer ? [makeModes("match", modes, [caption()])] : []));
   }
 
   paint(side, context, place, unit) {
@@ -241,39 +243,6 @@ class Page {
       drawMode(context, place, unit, COLOURS[0], mode.ellipse, mode.weight, { faint: Boolean(answer.said) });
       if (!(mode.visible < this.model.likely)) drawPixel(context, place, 0.8 * unit, COLOURS[0], mode.xy); // hidden: hollow
     });
-  }
-
-  makeTable({ xy, modes }) {
-    const percent = (value) => `${(100 * value).toFixed(0)} %`;
-    const row = (kind, cells) => make("tr", {}, ...cells.map((textContent) => make(kind, { textContent })));
-    const seen = (visible) =>
-      visible === undefined ? [] : [`${visible < this.model.likely ? "hidden" : "seen"}, ${percent(visible)}`];
-    const rows = modes.map((mode, k) =>
-      row("td", [
-        k + 1,
-        ...mode.xy.map((value) => value.toFixed(1)),
-        percent(mode.weight),
-        `± ${mode.spread_px.toFixed(0)} px`,
-        percent(mode.confidence),
-        ...seen(mode.visible),
-      ]),
-    );
-    const head = [
-      "match",
-      "x px",
-      "y px",
-      "weight",
-      "spread",
-      "confidence",
-      ...(modes[0]?.visible === undefined ? [] : ["seen there"]),
-    ];
-    return make(
-      "table",
-      {},
-      make("caption", { textContent: `Pixel (${xy.map((value) => value.toFixed(0)).join(", ")})` }),
-      make("thead", {}, row("th", head)),
-      make("tbody", {}, ...rows),
-    );
   }
 }
 

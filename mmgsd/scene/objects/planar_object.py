@@ -61,7 +61,7 @@ class PlanarObject:
         """Rebuild one from :meth:`to_dict`'s values."""
         mirror = None if values["mirror"] is None else np.array(values["mirror"])
         arrays = {"rest": np.array(values["rest"]), "faces": np.array(values["faces"]), "mirror": mirror}
-        group, size = SymmetryGroup.from_dict(values["group"]), tuple(values["size"])
+        group, size = SymmetryGroup(**values["group"]), tuple(values["size"])
         return cls(**{**values, **arrays, "group": group, "size": size})
 
 
