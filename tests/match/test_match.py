@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import pickle
+import warnings
 
 import numpy as np
 import pytest
 import torch
 from heatmaps import CELL_PX, CELLS, CORNERS, SIZE, draw_mixture, one_cell
 
+from mmgsd.match.describe import describe_answer
 from mmgsd.match.match import Match
 from mmgsd.match.matcher import make_match
 from mmgsd.model.network import compute_cell_centres
@@ -154,3 +156,11 @@ def test_where_nothing_shows_the_object_nothing_is_sure() -> None:
     match = answer(draw_mixture(CORNERS[:2], 8.0), 2)
     known = dataclasses.replace(match, on_object=np.array([0.4]), absent=np.array([0.5]))
     np.testing.assert_allclose(known.confidence(), 0.2 * match.confidence(), rtol=1e-6)
+
+
+def test_an_answer_is_described_without_the_old_names_which_warn() -> None:
+    match = answer(draw_mixture(CORNERS[:2], 8.0, np.array([0.75, 0.25])), 2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        (query,) = describe_answer(match)
+    assert query["outside"] == round(float(match.outlier_mass[0]), 4) and len(query["modes"]) == 2
