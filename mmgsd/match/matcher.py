@@ -489,13 +489,15 @@ def compute_scale(size: tuple[int, int], trained: tuple[int, int]) -> float:
 
 
 def read_heatmap(
-    heatmap: Tensor, n: int | str | Tensor, centres: tuple[Tensor, Tensor], *, readout: ModeReadout = AS_IT_IS,
-    merge: bool = False,
-) -> tuple[Mixture, Tensor]:  # fmt: skip
-    """Mixtures of ``n`` modes and entropies (S,) in nats of heatmaps (S, h, w) with cell ``centres`` (w,), (h,) px."""
+    heatmap: Tensor, n: int | str | Tensor, centres: tuple[Tensor, Tensor], **how: Any
+) -> tuple[Mixture, Tensor]:
+    """Mixtures of ``n`` modes and entropies (S,) in nats of heatmaps (S, h, w) with cell ``centres`` (w,), (h,) px.
+
+    ``how`` modes are fitted is as `fit_modes` has it.
+    """
     xs, ys = (c.float().to(heatmap.device) for c in centres)
     entropy = compute_entropy(heatmap.flatten(1), float((xs[1] - xs[0]) * (ys[1] - ys[0])))
-    return fit_modes(heatmap, n, xs, ys, readout=readout, merge=merge), entropy
+    return fit_modes(heatmap, n, xs, ys, **how), entropy
 
 
 def _check_size(size: tuple[int, int]) -> None:

@@ -76,7 +76,7 @@ class Mixture:
 @own_numerics()
 def fit_modes(
     heatmap: Tensor, n: int | str | Tensor, xs: Tensor, ys: Tensor, *, readout: ModeReadout = AS_IT_IS,
-    merge: bool = False,
+    merge: bool = False, start: Tensor | None = None,
 ) -> Mixture:  # fmt: skip
     """Fit an n-modal Gaussian mixture to each heatmap by weighted expectation-maximisation.
 
@@ -84,8 +84,9 @@ def fit_modes(
     criterion prefers; ``xs`` (w,) and ``ys`` (h,) cell centres in px. Symmetric modes are a priori equally likely,
     round and equally wide, the latter two as far as ``readout`` says: that decides which cell belongs to which mode,
     while the result holds the moments of the mass itself. With ``merge``, modes less than a cell apart are one, and
-    the others absent. Raises ValueError for ``n`` that is not from 1 to `MAX_MODES`, another word, or values that are
-    not finite.
+    the others absent. From ``start`` (S, N, 2) px, NaN where a query has no further mode, the fit goes on instead of
+    from the heatmap's peaks; ``n`` then does not count. Raises ValueError for ``n`` that is not from 1 to `MAX_MODES`,
+    another word, or values that are not finite.
     """
     count = check_count(n, "n", queries=len(heatmap))
     heatmap = heatmap.float()
@@ -96,7 +97,11 @@ def fit_modes(
     grid = heatmap.shape[1:]
     mass = _interpolate(mass, grid)
     powered = _raise(mass, readout.exponent)
-    if count is None:
+    step, middle = torch.stack([xs[1] - xs[0], ys[1] - ys[0]]), torch.stack([xs.mean(), ys.mean()])  # px a cell, px
+    if start is not None:
+        params = _make_params((start.to(mass) - middle) / step)
+        params = _run_em(powered, params, _describe_cells(grid, mass.device), readout.shape_prior)
+    elif count is None:
         params = _choose_fit(powered, grid, readout.shape_prior)
     else:
         most = int(count.max()) if count.numel() else 1
@@ -107,8 +112,7 @@ def fit_modes(
     order = params[..., 2].argsort(-1, descending=True)
     params = params.gather(1, order[..., None].expand_as(params))
     absent = (params[..., 2] == 0)[..., None]
-    step = torch.stack([xs[1] - xs[0], ys[1] - ys[0]])  # px a cell
-    modes = (params[..., :2] * step + torch.stack([xs.mean(), ys.mean()])).masked_fill(absent, torch.nan)
+    modes = (params[..., :2] * step + middle).masked_fill(absent, torch.nan)
     covariances = params[..., [3, 4, 4, 5]].unflatten(-1, (2, 2)) * step[:, None] * step
     return Mixture(modes, params[..., 2], covariances.masked_fill(absent[..., None], torch.nan), outlier_mass)
 
@@ -235,9 +239,16 @@ def _start(mass: Tensor, n: Tensor, n_max: int, grid: tuple[int, int]) -> Tensor
         rest = rest * (1 - blur_y[row][:, :, None] * blur_x[column][:, None])
         peaks.append(torch.stack([column, row], -1) - mass.new_tensor([(w - 1) / 2, (h - 1) / 2]))
     present = torch.arange(n_max, device=n.device) < n[:, None]
-    variance = torch.full(present.shape, KERNEL_CELLS**2, dtype=torch.float32, device=n.device)
-    rest = torch.stack([present.float() / n[:, None], variance, 0 * variance, variance], -1)
-    return torch.cat([torch.stack(peaks, 1), rest], -1)
+    return _make_params(torch.stack(peaks, 1).masked_fill(~present[..., None], torch.nan))
+
+
+def _make_params(places: Tensor) -> Tensor:
+    """Parameters of equal components at places (S, N, 2) in cells from the grid's centre; those at NaN are absent."""
+    present = places.isfinite().all(-1)
+    weight = present / present.sum(1, keepdim=True)
+    variance = torch.full_like(weight, KERNEL_CELLS**2)
+    rest = torch.stack([weight, variance, 0 * variance, variance], -1)
+    return torch.cat([places.nan_to_num(0.0), rest], -1)
 
 
 def _make_kernel(count: int, device: torch.device) -> Tensor:

@@ -316,3 +316,13 @@ def test_no_query_no_mode() -> None:
 def test_another_number_of_modes(n: object) -> None:
     with pytest.raises(ValueError, match=r"n must be an integer, or \(1,\) integers, from 1 to 64, or 'auto', got"):
         fit_modes(one_cell(3, 3), n, XS, YS)
+
+
+def test_a_fit_goes_on_from_a_start_and_leaves_out_what_is_not_there() -> None:
+    heatmap, xs, ys = draw_mixture(CORNERS, 8.0), XS, YS
+    start = torch.tensor(CORNERS[None, ::-1].copy() + 9.0)
+    start[:, 3] = torch.nan
+    fit = fit_modes(heatmap, 4, xs, ys, start=start)
+    assert fit.weights[0].count_nonzero() == 3 and fit.modes[0, -1].isnan().all()
+    whole = fit_modes(heatmap, 4, xs, ys, start=torch.tensor(CORNERS[None] + 9.0))
+    np.testing.assert_allclose(sorted(whole.modes[0].tolist()), sorted(CORNERS.tolist()), atol=0.5)

@@ -1,0 +1,148 @@
+"""What else the same weights answer where they are read in another way: error that costs no training.
+
+    python -m mmgsd run readout --preset round2 --set weights=cloth --set split=train    -> data/results/readout.json
+
+Every way is asked the same questions, about clean images and about the cluttered ones that go with them; neither may
+have been trained on. Half of the pairs choose the temperature; the errors are those of the other half.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import mmgsd
+from mmgsd.config import EvaluateConfig, load_preset
+from mmgsd.dataset import Dataset, load_dataset
+from mmgsd.match.matcher import QUARTERS, Matcher, read_heatmap
+from mmgsd.match.mixture import AS_IT_IS, Mixture
+from mmgsd.measure.evaluation import read_results, write_results
+from mmgsd.measure.metrics import aggregate
+from mmgsd.measure.questions import AnswerFunction, ask, choose_points, draw_pairs
+from mmgsd.model.heads import Outputs
+from mmgsd.model.network import compute_cell_centres
+from mmgsd.paths import Paths
+from mmgsd.progress import ProgressBar
+from mmgsd.studies.registry import Results, Study
+from mmgsd.studies.table import ERRORS, Table
+
+TEMPERATURES = (0.5, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0)  # times the calibrated one
+RESULTS = "readout.json"  # beside the presets' folders: shipped weights are of none
+QUESTIONS = EvaluateConfig(pairs=120, points=125)
+
+
+@dataclass(frozen=True)
+class Way:
+    """How weights are read, where it is not as they are shipped."""
+
+    label: str
+    temperature: float | None = None  # of the heatmaps; 0: that with the least error on half of the pairs
+    means: bool = False  # modes at the means of their shares, however the weights are read
+    turned: bool = False  # heatmaps of the target's quarter turns are averaged, not descriptors
+    flipped: bool = False  # and those of both images' mirror images
+    truth: bool = False  # the fit starts at the true matches: what no start can better
+
+
+WAYS = {
+    "shipped": Way("as it is shipped"),
+    "temperature 1": Way("temperature 1", temperature=1.0),
+    "least error": Way("temperature of the least error", temperature=0.0),
+    "means": Way("modes at the means of their shares", means=True),
+    "turned": Way("heatmaps of four turns averaged", turned=True),
+    "flipped": Way("heatmaps of both mirror images averaged", flipped=True),
+    "truth": Way("fit started at the truth", truth=True),
+}
+
+
+def run(paths: Paths, *, weights: str = "cloth", split: str = "test") -> Path:
+    """Ask one model in every way about a preset's images and the cluttered ones that go with them; readout.json."""
+    matcher, file = mmgsd.load(weights), paths.results.parent / RESULTS
+    for preset in (paths.preset, load_preset(paths.preset).cluttered):
+        data = load_dataset(Paths(paths.root, preset).dataset(matcher.object), split)
+        found = measure_ways(matcher, data)
+        rows = read_results(file, depth=3)
+        rows.setdefault(weights, {})[preset] = found
+        write_results(rows, file)
+    return file
+
+
+def measure_ways(
+    matcher: Matcher, data: Dataset, *, config: EvaluateConfig = QUESTIONS, ways: Mapping[str, Way] = WAYS
+) -> dict[str, dict[str, float]]:
+    """{way: its errors} over the queries with a visible source of every second pair."""
+    found, before = {}, matcher.temperature
+    images = _describe_all(matcher, data, config)
+    for name, way in ProgressBar(ways.items(), desc=f"ways of {matcher.config.object}", total=len(ways)):
+        scales = [before * factor for factor in TEMPERATURES] if way.temperature == 0 else [way.temperature or before]
+        tables = {}
+        for scale in scales:
+            matcher.temperature = scale
+            table = ask(_make_answer(matcher, data, config, way, images), data, config, matcher.config.group, False, "")
+            tables[scale] = table[table.visible]
+        best = min(tables, key=lambda scale: tables[scale].rmse_px[tables[scale].pair % 2 == 1].mean())
+        kept = tables[best][tables[best].pair % 2 == 0]
+        found[name] = {**aggregate(kept), "temperature": best}
+    matcher.temperature = before
+    return found
+
+
+def _describe_all(matcher: Matcher, data: Dataset, config: EvaluateConfig) -> dict[tuple[int, bool], list[Outputs]]:
+    """What the network says of each image, and of its mirror image, turned by each quarter and turned back."""
+    upright, described = copy.copy(matcher), {}
+    upright.turns = 1
+    for index in np.unique(draw_pairs(data, config)):
+        image = data.load_image(int(index))
+        for flipped in (False, True):
+            seen = image[:, ::-1] if flipped else image
+            turns = upright.describe([np.ascontiguousarray(np.rot90(seen, k)) for k in range(QUARTERS)])
+            said = [outputs.turn(-k) for k, outputs in enumerate(turns)]
+            described[int(index), flipped] = [_flip(outputs) for outputs in said] if flipped else said
+    return described
+
+
+def _flip(outputs: Outputs) -> Outputs:
+    """What is said of a mirror image, laid onto the image itself."""
+    values = {field.name: getattr(outputs, field.name) for field in fields(outputs)}
+    return Outputs(**{name: x.flip(-1) if x is not None and x.ndim > 1 else x for name, x in values.items()})
+
+
+def _make_answer(
+    matcher: Matcher, data: Dataset, config: EvaluateConfig, way: Way, images: Mapping[tuple[int, bool], list[Outputs]]
+) -> AnswerFunction:  # fmt: skip
+    symmetry, points = data.group(matcher.config.group), choose_points(config.points, data.n_points)
+    orbits = [symmetry.distinct_modes(int(point)) for point in points]
+    readout = AS_IT_IS if way.means else matcher.readout
+
+    def answer(first: int, second: int, xy: np.ndarray, n: np.ndarray) -> tuple[Mixture, Tensor]:
+        """Modes and entropies (nats) of pixels ``xy`` of the first image."""
+        heatmaps = []
+        for flipped in (False, True)[: 1 + way.flipped]:
+            source, target = Outputs.mean(images[first, flipped]), images[second, flipped]
+            targets = target if way.turned else [Outputs.mean(target)]
+            heatmaps += [matcher.compute_heatmaps(source, one, torch.from_numpy(xy), data.size) for one in targets]
+        heatmap = torch.stack(heatmaps).mean(0)
+        centres, start = compute_cell_centres(data.size, heatmap.shape[-2:]), None
+        if way.truth:
+            start = torch.full((len(orbits), int(n.max()), 2), torch.nan)
+            for row, orbit in zip(start, orbits, strict=True):
+                row[: len(orbit)] = torch.from_numpy(data.xy[second, orbit])
+        return read_heatmap(heatmap, torch.from_numpy(n), centres, readout=readout, start=start)
+
+    return answer
+
+
+def describe_ways(results: Results) -> Table:
+    """The errors of every way, a row each; weights and their images beside each other."""
+    parts = {f"{weights}, {images}": rows for weights, every in results.items() for images, rows in every.items()}
+    rows = {way.label: {part: found[name] for part, found in parts.items() if name in found}
+            for name, way in WAYS.items()}  # fmt: skip
+    return Table("read", {"": ERRORS}, {label: row for label, row in rows.items() if row}, list(parts))
+
+
+STUDY = Study("readout", 165, run, shows=lambda paths, **_: [paths.results.parent / RESULTS])
