@@ -36,11 +36,10 @@ def test_every_method_has_a_row_with_its_numbers() -> None:
     assert "32.4" in rows[-1] and "31.3" in rows[-1]
 
 
-def test_the_headline_and_the_longer_trained_are_rows_of_the_main_table() -> None:
+def test_the_headline_is_rows_of_the_main_table() -> None:
     rows = read_page(main.describe_main(RESULTS))
     headline = read_page(main.describe_main(RESULTS, methods=main.HEADLINE))
     assert set(headline) < set(rows) and len(headline) == 2 + 11
-    assert set(read_page(describe_errors(RESULTS, methods=main.LONGER_ROWS))) < set(rows[:-1])
 
 
 def test_some_queries_errors_are_a_row_each() -> None:
