@@ -44,7 +44,7 @@ def test_saved_weights_give_the_same_answer(matcher: Matcher, image: np.ndarray,
     loaded = Matcher.load(save_weights(tmp_path / "w.safetensors", matcher.network), device="cpu")
     one, two = (m.match(image, image[::-1], xy=[(50, 60)]).modes for m in (matcher, loaded))
     np.testing.assert_array_equal(one, two)
-    assert (loaded.config, loaded.modes, loaded.size) == (CONFIG, 4, SIZE)
+    assert (loaded.config, loaded.num_modes, loaded.size) == (CONFIG, 4, SIZE)
 
 
 def test_missing_weights(tmp_path: Path) -> None:
@@ -173,4 +173,4 @@ def test_a_header_that_begins_as_a_pickle_does_is_no_pickle(matcher: Matcher, tm
         if path.read_bytes()[0] == 0x80:
             break
     assert path.read_bytes()[0] == 0x80
-    assert Matcher.load(path, device="cpu").modes == matcher.num_modes
+    assert Matcher.load(path, device="cpu").num_modes == matcher.num_modes

@@ -17,6 +17,7 @@ import pytest
 from batches import run_child
 from dask.distributed import LocalCluster
 
+from mmgsd.cluster import unchanged_environment
 from mmgsd.config import RenderConfig
 from mmgsd.dataset import check_dataset, load_dataset
 from mmgsd.files import ForeignFileError, LockedError, locked, scratch_folder, write_json
@@ -107,7 +108,7 @@ def test_a_lost_worker_of_a_foreign_cluster_costs_nothing_but_time(tmp_path: Pat
     undisturbed, disturbed = tmp_path / "undisturbed", tmp_path / "disturbed"
     assert start(undisturbed, 1).wait(300) == 0
     how = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
-    with stage._unchanged_environment(), LocalCluster(n_workers=2, threads_per_worker=1, **how) as cluster:
+    with unchanged_environment(), LocalCluster(n_workers=2, threads_per_worker=1, **how) as cluster:
         first = {worker.pid for worker in cluster.workers.values()}
         process = start(disturbed, 0, cluster.scheduler_address)
         killed = wait_for(lambda: next((pid for pid in first if list_blenders(pid)), None))

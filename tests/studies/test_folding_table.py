@@ -72,5 +72,5 @@ def test_rollouts_of_which_none_counts_are_dashes() -> None:
     part = RESULTS["policies"]["cloth"]["truth"]["all"]
     rows = {"truth": {"all": part, "cautious": {"count": 0}, "beyond": {}, "rollouts": {}}}
     results = {"run": RESULTS["run"], "policies": {"cloth": rows, "rope": rows}}
-    assert to_markdown(describe_folding(results)).splitlines()[2] == f"| true matches |{' – |' * 10}"
+    assert to_markdown(describe_folding(results)).splitlines()[2] == f"| true matches |{' – |' * 8}"
     assert "0 of 10 rollouts count" in make_folding_sentence(results)

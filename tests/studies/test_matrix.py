@@ -217,28 +217,14 @@ def tell(task: str, *, progress: bool) -> tuple[str, bool, int, int]:
     return task, progress, os.getpid(), torch.get_num_threads()
 
 
-@pytest.mark.parametrize(("threads", "processes"), [(1, 1), (2, 2), (6, 3)])
+@pytest.mark.parametrize(("threads", "processes"), [(1, 1), (4, 2)])
 def test_tasks_share_the_threads_between_processes_or_run_here_one_after_another(threads, processes):
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
-        told = dict(run_each(tell, {(k,): f"task {k}" for k in range(3)}, desc="tasks"))
+        told = dict(run_each(tell, {(k,): f"task {k}" for k in range(2)}, desc="tasks"))
     finally:
         torch.set_num_threads(before)
-    assert {name: row[0] for name, row in told.items()} == {(k,): f"task {k}" for k in range(3)}
+    assert {name: row[0] for name, row in told.items()} == {(k,): f"task {k}" for k in range(2)}
     assert all(row[1] == (processes == 1) and (row[2] == os.getpid()) == (processes == 1) for row in told.values())
     assert {row[3] for row in told.values()} == {threads // processes}
-
-
-def fail(task: str, *, progress: bool) -> str:
-    raise ValueError(f"{task} must be another")
-
-
-def test_what_a_process_refuses_is_raised_here_as_it_is():
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    try:
-        with pytest.raises(ValueError, match="task . must"):
-            list(run_each(fail, {0: "task 0", 1: "task 1"}, desc="tasks"))
-    finally:
-        torch.set_num_threads(before)
