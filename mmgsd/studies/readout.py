@@ -17,10 +17,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-import mmgsd
 from mmgsd.config import EvaluateConfig, load_preset
 from mmgsd.dataset import Dataset, load_dataset
-from mmgsd.match.matcher import QUARTERS, Matcher, read_heatmap
+from mmgsd.match.matcher import QUARTERS, Matcher, load, read_heatmap
 from mmgsd.match.mixture import AS_IT_IS, Mixture
 from mmgsd.measure.evaluation import read_results, write_results
 from mmgsd.measure.metrics import aggregate
@@ -62,7 +61,7 @@ WAYS = {
 
 def run(paths: Paths, *, weights: str = "cloth", split: str = "test") -> Path:
     """Ask one model in every way about a preset's images and the cluttered ones that go with them; readout.json."""
-    matcher, file = mmgsd.load(weights), paths.results.parent / RESULTS
+    matcher, file = load(weights), paths.results.parent / RESULTS
     for preset in (paths.preset, load_preset(paths.preset).cluttered):
         data = load_dataset(Paths(paths.root, preset).dataset(matcher.object), split)
         found = measure_ways(matcher, data)
