@@ -245,7 +245,7 @@ def _start(mass: Tensor, n: Tensor, n_max: int, grid: tuple[int, int]) -> Tensor
 def _make_params(places: Tensor) -> Tensor:
     """Parameters of equal components at places (S, N, 2) in cells from the grid's centre; those at NaN are absent."""
     present = places.isfinite().all(-1)
-    weight = present / present.sum(1, keepdim=True)
+    weight = present.to(places) / present.sum(1, keepdim=True)
     variance = torch.full_like(weight, KERNEL_CELLS**2)
     rest = torch.stack([weight, variance, 0 * variance, variance], -1)
     return torch.cat([places.nan_to_num(0.0), rest], -1)
