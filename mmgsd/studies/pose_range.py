@@ -13,14 +13,13 @@ from __future__ import annotations
 
 import dataclasses
 import statistics
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
-from scipy import stats
 
 from mmgsd.checks import check_choice, read_count
 from mmgsd.config import OBJECTS, TrainConfig, load_preset
@@ -35,12 +34,13 @@ from mmgsd.studies.claims import MARGIN, Claim, get
 from mmgsd.studies.matrix import run_each
 from mmgsd.studies.models import ROWS, Model, configure_study, get_colour, get_label, get_line_style
 from mmgsd.studies.registry import Results, Shown, Study, read_table
+from mmgsd.studies.seeds import compare_seeds, list_seeds, say_seeds
 from mmgsd.studies.table import Column, Table
 
 LIMITS_DEG = (15, 45, 90, 180)  # of the object's turn, both ways; the last is any
 METHODS = ("mmgsd", "unimodal", "spcl", "pcl")
 SEEDS = 3
-NARROW = (15, 45)  # limits within which a pose tells the labelling: less than half a cloth's or a rope's own turn
+NARROW = (15, 45)  # limits within which a pose tells the labelling: no more than half of the turn that looks alike
 
 
 def list_models(preset: str, object: str, seeds: int) -> dict[str, TrainConfig]:
@@ -103,45 +103,42 @@ def _list_objects(objects: str | Sequence[str]) -> list[str]:
     return [objects] if isinstance(objects, str) else list(objects)
 
 
-def list_errors(results: Results, object: str, limit: int, method: str, *, measure: str = "rmse_mean",
-                tested: str = "within") -> list[float]:  # fmt: skip
-    """A method's seeds at a limit: [errors]."""
-    rows = get(results, object, str(limit)) or {}
-    return [row[tested][measure] for key, row in rows.items() if key.rpartition("-")[0] == method]
+def get_rows(results: Results, object: str, limit: int, asked: str = "within") -> dict[str, Any]:
+    """{"mmgsd-0": errors} of the models trained within a limit, asked about poses ``within`` it or about ``any``."""
+    return {key: row[asked] for key, row in (get(results, object, str(limit)) or {}).items()}
 
 
 def describe_limits(results: Results) -> Table:
-    """Mean ± std over seeds of the error, and what is found, by limit and method; p of Welch's test against MMGSD's."""
-    rows = {}
+    """Mean ± std over seeds of the error, and what is found, by limit and method.
+
+    p is that of Welch's test against MMGSD's seeds, by Holm's correction for all that are compared (`compare_seeds`).
+    """
+    arms = {(name, limit): get_rows(results, name, limit) for name in OBJECTS for limit in LIMITS_DEG}
+    tested, lines = compare_seeds(arms), {}
     for limit in LIMITS_DEG:
         for method in METHODS:
-            row = {name: _describe_row(results, name, limit, method) for name in OBJECTS}
-            rows[f"{say_limit(limit)}, {get_label(method, short=True)}"] = {n: r for n, r in row.items() if r}
+            row = {name: _describe_row(results, name, limit, method) for name in OBJECTS if arms[name, limit]}
+            for name in row:
+                row[name]["p"] = tested.get(((name, limit), method), (None, None))[1]
+            lines[f"{say_limit(limit)}, {get_label(method, short=True)}"] = row
     columns = [
-        Column("rmse", "RMSE", "RMSE px"), Column("found", "≤20", "pck@20px", ".0f", scale=100),
+        Column("rmse", "RMSE", "RMSE px", optional=True),
+        Column("found", "≤20", "pck@20px", ".0f", scale=100, optional=True),
         Column("p", "p", "p", ".3f", optional=True), Column("any", "all poses", "RMSE px, all poses", optional=True),
     ]  # fmt: skip
-    return Table("poses, method", {"": columns}, {label: row for label, row in rows.items() if row}, OBJECTS)
+    return Table("poses, method", {"": columns}, {label: row for label, row in lines.items() if row}, OBJECTS)
 
 
 def _describe_row(results: Results, object: str, limit: int, method: str) -> dict[str, Any]:
-    errors, ours = (list_errors(results, object, limit, m) for m in (method, "mmgsd"))
-    if not errors:
-        return {}
-    tested = method != "mmgsd" and min(len(errors), len(ours)) > 1
-    found = list_errors(results, object, limit, method, measure="pck@20px")
-    every = list_errors(results, object, limit, method, tested="any")
-    return {
-        "rmse": say_spread(errors), "found": statistics.mean(found),
-        "p": float(stats.ttest_ind(errors, ours, equal_var=False).pvalue) if tested else None,
-        "any": statistics.mean(every) if limit != LIMITS_DEG[-1] else None,
-    }  # fmt: skip
+    within = get_rows(results, object, limit)
+    every = None if limit == LIMITS_DEG[-1] else _mean(get_rows(results, object, limit, "any"), method)
+    return {"rmse": say_seeds(within, method), "found": _mean(within, method, "pck@20px"), "any": every}
 
 
-def say_spread(errors: Sequence[float]) -> str:
-    """ "42.5 ± 0.8", or a single error."""
-    spread = f" ± {statistics.stdev(errors):.1f}" if len(errors) > 1 else ""
-    return f"{statistics.mean(errors):.1f}{spread}"
+def _mean(rows: Mapping[str, Results], method: str, measure: str = "rmse_mean") -> float | None:
+    """The mean of a measure over a method's seeds; None of none."""
+    values = [row[measure] for key, row in rows.items() if key.rpartition("-")[0] == method]
+    return statistics.mean(values) if values else None
 
 
 def say_limit(limit: int) -> str:
@@ -159,7 +156,7 @@ def plot_limits(results: Results) -> Figure | None:
     places = range(len(LIMITS_DEG))
     for axis, name in zip(axes[0], there, strict=True):
         for method in METHODS:
-            errors = [list_errors(results, name, limit, method) for limit in LIMITS_DEG]
+            errors = [list_seeds(get_rows(results, name, limit), method) for limit in LIMITS_DEG]
             known = [k for k in places if errors[k]]
             axis.plot(known, [statistics.mean(errors[k]) for k in known], **get_line_style(method))
             axis.scatter([k for k in known for _ in errors[k]], [e for k in known for e in errors[k]], s=8,
@@ -201,8 +198,8 @@ def judge_one_match(results: Results) -> Claim:
 
 def _compute_gap(results: Results, object: str, limit: int) -> float | None:
     """By which share Unimodal's mean error is above MMGSD's."""
-    theirs, ours = (list_errors(results, object, limit, method) for method in ("unimodal", "mmgsd"))
-    return statistics.mean(theirs) / statistics.mean(ours) - 1 if theirs and ours else None
+    theirs, ours = (_mean(get_rows(results, object, limit), method) for method in ("unimodal", "mmgsd"))
+    return theirs / ours - 1 if theirs and ours else None
 
 
 def _say_gap(gap: float | None) -> str:

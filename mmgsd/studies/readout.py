@@ -28,7 +28,7 @@ from mmgsd.model.heads import Outputs
 from mmgsd.model.network import compute_cell_centres
 from mmgsd.paths import Paths
 from mmgsd.progress import ProgressBar
-from mmgsd.studies.registry import Results, Study
+from mmgsd.studies.registry import Results, Shown, Study
 from mmgsd.studies.table import ERRORS, Table
 
 TEMPERATURES = (0.5, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0)  # times the calibrated one
@@ -144,4 +144,7 @@ def describe_ways(results: Results) -> Table:
     return Table("read", {"": ERRORS}, {label: row for label, row in rows.items() if row}, list(parts))
 
 
-STUDY = Study("readout", 165, run, shows=lambda paths, **_: [paths.results.parent / RESULTS])
+STUDY = Study(
+    "readout", 165, run, shows=lambda paths, **_: [paths.results.parent / RESULTS],
+    tables={"readout": Shown(RESULTS, describe_ways)},
+)  # fmt: skip

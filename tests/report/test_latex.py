@@ -265,7 +265,7 @@ def test_other_tables_have_their_numbers() -> None:
     assert rows["uncertainty_table"][r"\textbf{MMGSD} (ours)"][5] == r"50\,$\to$\,91"
     assert rows["uncertainty_table"][r"\textbf{MMGSD} (ours)"][-2:] == ["0.60", "--"]
     assert rows["fixes_table"][r"cloth, $\pm$45$^\circ$ only"] == ["60.0", "59.0", "20.0", "--", "40", "--"]
-    assert rows["pose_range_table"][r"any, Unimodal"] == ["41.0", "20", "--", "--"] * 2
+    assert rows["pose_range_table"][r"any, Unimodal"] == ["41.0 (1)", "20", "--", "--"] * 2
     assert rows["errors_table"]["no match hidden"] == ["25.0", "25.0"]
     assert rows["runs_table"]["SPCL"] == ["100", "1.5"] * 2
 

@@ -12,7 +12,7 @@ from mmgsd.config import OBJECTS
 from mmgsd.learn import losses
 from mmgsd.measure.evaluation import read_results
 from mmgsd.paths import Paths
-from mmgsd.studies import pose_range
+from mmgsd.studies import matrix, pose_range
 from mmgsd.studies.claims import HELD, IN_PART, NOT_HELD, NOT_MEASURED
 from mmgsd.studies.table import to_markdown
 
@@ -52,7 +52,7 @@ def test_table_has_spread_and_p_of_each_limit_and_figure_its_seeds():
     results = make_results(**CONJECTURE)["pose_range"]
     lines = to_markdown(pose_range.describe_limits(results)).splitlines()
     cloth = [line for line in lines if "±15°, Unimodal" in line]
-    assert "71.0 ± 1.0" in cloth[0] and "50 %" in cloth[0] and "0.000" in cloth[0]
+    assert "71.0 ± 1.0 (3)" in cloth[0] and "50 %" in cloth[0] and "0.000" in cloth[0]
     assert len(pose_range.plot_limits(results).axes) == 2
     assert pose_range.plot_limits({}) is None
 
@@ -84,6 +84,7 @@ def test_run_trains_within_each_limit_asks_both_and_goes_on(tmp_path, tiny_datas
 
     monkeypatch.setattr(pose_range, "render_dataset", render)
     monkeypatch.setattr(pose_range, "train_model", partial(train, pose_range.train_model))
+    monkeypatch.setattr(matrix, "PROCESSES", 1)  # other processes would not see what is replaced here
     monkeypatch.setattr(pose_range, "LIMITS_DEG", (15, 180))
     monkeypatch.setattr(pose_range, "METHODS", ("mmgsd", "unimodal"))
     paths = Paths(tmp_path, "smoke")
