@@ -128,6 +128,7 @@ class TrainConfig:
     roundness: float = _later(ROUNDNESS)  # of the modes read from heatmaps, a priori (`mmgsd.match.mixture.fit_modes`)
     heads: bool = _later(False)  # it also learns where the object is, what is seen, whether it is there (`learn.heads`)
     clutter: bool = _later(False)  # augmentation changes backgrounds and puts things in front (`learn.compositing`)
+    strong: bool = _later(False)  # augmentation also prints the object anew and zooms and shifts further
     also: str = _later("")  # preset whose images of the object are trained on besides the data set's own, or ""
     seed: int = 0
 
@@ -157,6 +158,8 @@ class TrainConfig:
         for name in ("weight_decay", "seed"):
             check(name, getattr(self, name), "at least 0", getattr(self, name) >= 0)
         check("heads", self.heads, f"False for {self.network!r}", not self.heads or self.network in PASSES)
+        if self.strong:
+            check("strong", self.strong, "False for an object of your own", self.object in OBJECTS)
         if self.also:
             check_choice("also", self.also, tuple(PRESETS))
 

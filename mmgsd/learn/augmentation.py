@@ -16,11 +16,14 @@ from torch import Tensor
 
 from mmgsd.config import TrainConfig
 from mmgsd.dataset import Dataset
-from mmgsd.learn.compositing import composite, disturb
+from mmgsd.learn.compositing import composite, disturb, fill_object
+from mmgsd.learn.printing import print_object
 from mmgsd.model.network import compute_input_size
 
 CACHE_SCALE = 1.25  # images are kept in memory at this multiple of the network's input size
-SHIFT = 0.06  # of an image's size, by which it is moved at most
+SHIFT, SCALE = 0.06, 0.2  # the most that an image is moved, of its size, and the log of its zoom
+STRONG_SHIFT, STRONG_SCALE = 0.15, 0.35  # where augmentation is strong: objects are cut off by the image's border
+PRINTED = 0.5  # share of the images whose object is printed anew then
 WAVES = 4  # that bend an image
 BEND_ITERATIONS = 12
 
@@ -84,11 +87,12 @@ UNCHANGED = Warp(np.eye(2, 3), np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
 
 
 def sample_warp(
-    size: tuple[int, int], rng: np.random.Generator, *, rotate: bool = True, scale: float = 0.2, bend: float = 0.0
-) -> Warp:
+    size: tuple[int, int], rng: np.random.Generator, *, rotate: bool = True, scale: float = SCALE,
+    shift: float = SHIFT, bend: float = 0.0,
+) -> Warp:  # fmt: skip
     """A random similarity of the image plane about the image's centre, bent by ``WAVES`` random waves.
 
-    Angle uniform over the circle (0 without ``rotate``), size times exp(± ``scale``), moved by up to `SHIFT` of the
+    Angle uniform over the circle (0 without ``rotate``), size times exp(± ``scale``), moved by up to ``shift`` of the
     image's size; the waves are half to a whole image long and stretch or squeeze by up to ``bend`` in all.
     """
     width, height = size
@@ -97,7 +101,7 @@ def sample_warp(
     cosine, sine = zoom * np.cos(angle), zoom * np.sin(angle)
     linear = np.array([[cosine, -sine], [sine, cosine]])
     centre = np.array([(width - 1) / 2, (height - 1) / 2])
-    move = rng.uniform(-SHIFT, SHIFT, 2) * (width, height)
+    move = rng.uniform(-shift, shift, 2) * (width, height)
     affine = np.column_stack([linear, centre - linear @ centre + move])
     direction, towards = rng.uniform(0, 2 * np.pi, (2, WAVES))
     number = rng.uniform(1, 2, WAVES) * 2 * np.pi / max(size)  # rad/px
@@ -160,7 +164,7 @@ def make_batch(
     """Augment the images ``indices`` (B,), labels with them, and move them to the device.
 
     Half of them are mirrored where the object has a mirror image; with ``config.clutter`` they are also put together
-    anew (`mmgsd.learn.compositing`).
+    anew (`mmgsd.learn.compositing`), with ``config.strong`` printed anew (`mmgsd.learn.printing`).
     """
     made = [_make_one(images, int(index), config, rng) for index in indices]
     image, mask, xy, visible, present = (np.stack(values) for values in zip(*made, strict=True))
@@ -175,19 +179,38 @@ def _make_one(images: TrainingImages, index: int, config: TrainConfig, rng: np.r
     size, warp, xy = compute_input_size(images.size, config.input_px), UNCHANGED, images.xy[index]
     visible, present = images.visible[index], images.present is None or bool(images.present[index])
     if config.augment:
-        warp = sample_warp(images.size, rng, rotate=config.rotate, bend=config.bend)
+        reach = {"scale": STRONG_SCALE, "shift": STRONG_SHIFT} if config.strong else {}
+        warp = sample_warp(images.size, rng, rotate=config.rotate, bend=config.bend, **reach)
         if images.mirror is not None and rng.random() < 0.5:
             mirror = [[-1, 0, images.size[0] - 1], [0, 1, 0], [0, 0, 1]]  # columns backwards
             warp = dataclasses.replace(warp, affine=warp.affine @ mirror)
             xy, visible = xy[images.mirror], visible[images.mirror]
-    image, mask = warp_images([images.images[index], images.masks[index]], warp, images.size, size)
+    planes = [images.images[index], images.masks[index]]
+    if config.strong:
+        image, mask = _warp_once(planes, warp, images.size, size)
+    else:
+        image, mask = warp_images(planes, warp, images.size, size)
     xy = warp.move(xy)
+    if config.strong and present and rng.random() < PRINTED:
+        there = rescale(xy, images.size, size)
+        image = print_object(image, mask, there, visible, config.object, lambda: _borrow(images, rng), rng)
     if config.clutter:
-        made = composite(image, mask, lambda: _borrow(images, rng), rng)
+        beside = not config.strong or config.object == "rope"
+        made = composite(image, mask, lambda: _borrow(images, rng), rng, sheets_beside=beside)
         image, mask, present = made.image, made.mask, present and made.present
         visible = visible & ~_look_up(made.covered, xy, images.size) & present
     image = jitter_colours(image, rng) if config.augment else image
     return disturb(image, rng) if config.clutter else image, mask > 127, xy, visible, present
+
+
+def _warp_once(
+    planes: list[np.ndarray], warp: Warp, full: tuple[int, int], size: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """`warp_images` of an image and its mask, without what the mirrored background shows of the object once more."""
+    image, mask = warp_images([np.dstack(planes), planes[1]], warp, full, size)
+    copies = np.where(mask > 0, 0, image[..., 3])
+    image = np.ascontiguousarray(image[..., :3])
+    return (fill_object(image, copies) if copies.any() else image), mask
 
 
 def _borrow(images: TrainingImages, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

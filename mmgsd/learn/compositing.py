@@ -20,6 +20,7 @@ COVERED = 0.3  # share with things in front of the object
 THINGS = 5  # fewer than so many lie behind the object
 BORROWED = 0.5  # share of the new backgrounds that come from other training images
 CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])  # of a square
+ALIKE, UNDER = 0.25, 0.5  # of the object's area: a thing so large is like it, one that has so much of it lies under it
 NATURAL, FLAT = 0.35, 0.2  # of the procedural ones: noise of all scales, and one colour
 
 
@@ -34,16 +35,19 @@ class Picture:
 
 
 def composite(
-    image: np.ndarray, mask: np.ndarray, borrow: Callable[[], tuple[np.ndarray, np.ndarray]], rng: np.random.Generator
-) -> Picture:
+    image: np.ndarray, mask: np.ndarray, borrow: Callable[[], tuple[np.ndarray, np.ndarray]],
+    rng: np.random.Generator, *, sheets_beside: bool = True,
+) -> Picture:  # fmt: skip
     """Give an image (h, w, 3) uint8 with its object's ``mask`` (h, w) uint8 another background, things and occluders.
 
-    ``borrow`` draws another image with its mask, of any size. What happens is up to ``rng``, see the constants.
+    ``borrow`` draws another image with its mask, of any size. What happens is up to ``rng``, see the constants. Without
+    ``sheets_beside`` nothing as large as a cloth lies beside the object, only under it: which of two is the cloth?
     """
     present, replaced = rng.random() >= REMOVED, rng.random() < REPLACED
     if replaced or not present:
         ground = _draw_ground(image.shape[:2], borrow, rng)
-        draw_things(ground, rng, int(rng.integers(THINGS)), size=(0.15, 1.1) if present else (0.05, 0.3))
+        under = None if sheets_beside or not present else mask
+        draw_things(ground, rng, int(rng.integers(THINGS)), size=(0.15, 1.1) if present else (0.05, 0.3), under=under)
         image, mask = (_paste(ground, image, mask, rng), mask) if present else (ground, np.zeros_like(mask))
     covered = np.zeros(mask.shape, bool)
     if rng.random() < COVERED:
@@ -54,11 +58,13 @@ def composite(
 
 
 def draw_things(
-    image: np.ndarray, rng: np.random.Generator, count: int, *, size: tuple[float, float] = (0.15, 1.1)
-) -> np.ndarray:
+    image: np.ndarray, rng: np.random.Generator, count: int, *, size: tuple[float, float] = (0.15, 1.1),
+    under: np.ndarray | None = None, shadows: bool = True,
+) -> np.ndarray:  # fmt: skip
     """Draw sheets, boxes, discs and bars with soft shadows into ``image`` (h, w, 3) uint8, in place.
 
-    Their sides are ``size`` of the image's longer side. Returns where they lie, (h, w) bool.
+    Their sides are ``size`` of the image's longer side. Of an object that will lie ``under`` this mask (h, w) uint8,
+    those that look like it and lie beside it are left out. Returns where they lie, (h, w) bool.
     """
     covered = np.zeros(image.shape[:2], bool)
     for _ in range(count):
@@ -66,9 +72,12 @@ def draw_things(
         x, y, width, height = cv2.boundingRect(shape)
         if not width:
             continue  # it lies out of the picture
-        _cast_shadow(image, shape, rng)
+        if under is not None and _lies_beside(shape > 0, under > 0):
+            continue
+        if shadows:
+            _cast_shadow(image, shape, rng)
         part = slice(y, y + height), slice(x, x + width)
-        cv2.copyTo(_colour_in((height, width), rng), shape[part], image[part])
+        cv2.copyTo(fill_area((height, width), rng), shape[part], image[part])
         covered |= shape > 0
     return covered
 
@@ -108,11 +117,11 @@ def _draw_ground(
 ) -> np.ndarray:
     if rng.random() < BORROWED:
         other, mask = borrow()
-        return _crop(fill_object(other, mask), shape, rng)
-    return _colour_in(shape, rng, black_or_white=0.12)
+        return crop(fill_object(other, mask), shape, rng)
+    return fill_area(shape, rng, black_or_white=0.12)
 
 
-def _crop(image: np.ndarray, shape: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
+def crop(image: np.ndarray, shape: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
     """A turned and mirrored part of an image, resized to (h, w)."""
     image = np.rot90(image, int(rng.integers(4)))[:: 1 if rng.random() < 0.5 else -1]
     sides = [max(8, int(side * rng.uniform(0.5, 1.0))) for side in image.shape[:2]]
@@ -121,9 +130,9 @@ def _crop(image: np.ndarray, shape: tuple[int, int], rng: np.random.Generator) -
     return cv2.resize(part, shape[::-1], interpolation=cv2.INTER_LINEAR)
 
 
-def _colour_in(shape: tuple[int, int], rng: np.random.Generator, *, black_or_white: float = 0.05) -> np.ndarray:
+def fill_area(shape: tuple[int, int], rng: np.random.Generator, *, black_or_white: float = 0.05) -> np.ndarray:
     """An area (h, w, 3) of one colour, noise, stripes or checks."""
-    colour = _draw_colour(rng)
+    colour = draw_colour(rng)
     kind = rng.random()
     if kind < black_or_white:
         return np.full((*shape, 3), 255 * int(rng.random() < 0.4), np.uint8)
@@ -135,7 +144,7 @@ def _colour_in(shape: tuple[int, int], rng: np.random.Generator, *, black_or_whi
     return cv2.applyColorMap(levels, ramp.clip(0, 255).astype(np.uint8)[:, None])
 
 
-def _draw_colour(rng: np.random.Generator) -> np.ndarray:
+def draw_colour(rng: np.random.Generator) -> np.ndarray:
     """(3,) in 0 to 255: as many greys as colours."""
     grey = rng.uniform(0, 255)
     return (grey + rng.uniform(-1, 1, 3) * rng.choice([4, 30, 120])).clip(0, 255).astype(np.float32)
@@ -186,6 +195,11 @@ def _draw_shape(shape: tuple[int, int], rng: np.random.Generator, size: tuple[fl
     places = corners @ np.array([[c, s], [-s, c]]) + middle
     cv2.fillConvexPoly(canvas, np.rint(places * 8).astype(np.int32), 255, cv2.LINE_8, 3)
     return canvas
+
+
+def _lies_beside(thing: np.ndarray, object: np.ndarray) -> bool:
+    """Whether a thing (h, w) bool is large enough to be taken for the object, and not mostly under it."""
+    return thing.sum() > ALIKE * object.sum() and (thing & object).sum() < UNDER * object.sum()
 
 
 def _cast_shadow(image: np.ndarray, shape: np.ndarray, rng: np.random.Generator) -> None:

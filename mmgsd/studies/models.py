@@ -129,7 +129,8 @@ MODELS = (
     # the shipped models' training: stretches of new images each, the first from the backbone's weights
     Model("round1", "MMGSD, round 1", "light", {"seed": 1, "steps": by_object(cloth=4000, rope=3000)}, ("rounds",)),
     *(Model(f"round{n}", f"MMGSD, round {n}", f"round{n - 1}",
-            {"seed": n, "trunk_weights": LAST_ROUND, "learning_rate": 1e-3, "sigma_start_px": 8.0}, ("rounds",))
+            {"seed": n, "trunk_weights": LAST_ROUND, "learning_rate": 1e-3, "sigma_start_px": 8.0,
+             "strong": by_object(cloth=n > 2, rope=True)}, ("rounds",))
       for n in range(2, ROUNDS + 1)),
     # what each part of the shipped models' training brings, one after another
     Model("mmgsd_workspace", "MMGSD, workspace renders too", "mmgsd", {"also": "workspace"}, ("robustness",),
