@@ -122,6 +122,7 @@ class TrainConfig:
     prototype_weight: float = -1.0  # of the dense supervision by single images; -1: 0 for pcl and spcl, 1 for others
     margin: float = 0.5  # contrastive losses only
     non_matches: int = 150  # a match, half of them on the object (contrastive losses only)
+    hidden_matches: bool = _later(False)  # contrastive losses also learn matches that are hidden in the target
     augment: bool = True
     bend: float = 0.0  # augmentation stretches and squeezes images along random waves, by up to this share
     rotate: bool = True  # augmentation turns images by any angle; off where the rotation limit is the experiment
@@ -158,6 +159,8 @@ class TrainConfig:
         for name in ("weight_decay", "seed"):
             check(name, getattr(self, name), "at least 0", getattr(self, name) >= 0)
         check("heads", self.heads, f"False for {self.network!r}", not self.heads or self.network in PASSES)
+        allowed = not self.hidden_matches or self.method in CONTRASTIVE
+        check("hidden_matches", self.hidden_matches, f"False for {self.method!r}, which always learns them", allowed)
         if self.strong:
             check("strong", self.strong, "False for an object of your own", self.object in OBJECTS)
         if self.also:

@@ -126,6 +126,7 @@ def test_stored_values_give_the_same_configuration() -> None:
 def test_digest_changes_with_every_field(config: RenderConfig | TrainConfig | EvaluateConfig, name: str) -> None:
     value = getattr(config, name)
     other = OTHER[name] if name in OTHER else (not value if isinstance(value, bool) else value + 1)
+    config = dataclasses.replace(config, method="spcl") if name == "hidden_matches" else config
     assert digest(dataclasses.replace(config, **{name: other})) != digest(config)
 
 

@@ -46,7 +46,8 @@ def compute_loss(
     modes = batch.xy[pair[1][:, None, None], orbit]  # (K, Q, G, 2)
     valid = batch.inside[pair[1][:, None, None], orbit] & batch.askable[pair[0][:, None], points][..., None]
     if config.method in CONTRASTIVE:
-        valid = valid & batch.askable[pair[1][:, None, None], orbit]  # as in Dense Object Nets: seen in both images
+        if not config.hidden_matches:  # as in Dense Object Nets: seen in both images
+            valid = valid & batch.askable[pair[1][:, None, None], orbit]
         there = sampled[pair[1][:, None, None], orbit, -config.descriptor_dim :]  # (K, Q, G, D)
         match = (source[:, :, None] - there).square().sum(-1)
         distance2, is_non_match = _sample_non_matches(config, target, batch, pair, source, modes, size, generator)

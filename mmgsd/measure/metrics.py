@@ -82,19 +82,26 @@ def compute_mode_lists(
     return dict(zip(LISTS, values, strict=True))
 
 
-def compute_query_errors(modes: np.ndarray, covariances: np.ndarray, true: np.ndarray) -> dict[str, np.ndarray]:
+def compute_query_errors(
+    modes: np.ndarray, covariances: np.ndarray, true: np.ndarray, seen: np.ndarray | None = None
+) -> dict[str, np.ndarray]:
     """Per-query metrics of (S, n, 2) modes, most probable first, and their (S, n, 2, 2) covariances: each value (S,).
 
     ``rmse_px`` is the root mean square over a query's modes (the paper's formula lacks the root of its name),
     ``nearest_px`` the distance of the most probable mode to the nearest true one, ``best_px`` that of the mode with the
     least spread (the first where no spread is known), ``pck@5px`` … the share of true modes found that near,
-    ``swapped`` that of modes nearer to a wrong point of the orbit than to their own.
+    ``swapped`` that of modes nearer to a wrong point of the orbit than to their own. Where it is known which true
+    matches are ``seen`` (S, n) bool, ``rmse_seen_px`` is that over those alone, NaN where there is none.
     """
     errors = compute_mode_errors(modes, true)
     nearest = np.linalg.norm(true - modes[:, :1], axis=-1).min(1)
     spread = np.nan_to_num(np.trace(covariances, axis1=-2, axis2=-1), nan=np.inf)
     best = np.take_along_axis(modes, spread.argmin(1)[:, None, None], 1)  # (S, 1, 2)
     shares = {f"pck@{t}px": (errors <= t).mean(1) for t in PCK_PX}
+    if seen is not None:
+        count = seen.sum(1)
+        mean = np.where(seen, np.square(errors), 0).sum(1) / count.clip(min=1)
+        shares["rmse_seen_px"] = np.where(count > 0, np.sqrt(mean), np.nan)
     return {
         "rmse_px": np.sqrt(np.square(errors).mean(1)),
         "nearest_px": nearest,
@@ -105,8 +112,12 @@ def compute_query_errors(modes: np.ndarray, covariances: np.ndarray, true: np.nd
 
 
 def aggregate(queries: pd.DataFrame) -> dict[str, float]:
-    """Summary of a table of queries: ``rmse_mean``, ``rmse_pooled``, ``median`` (px), nearest and shares."""
+    """Summary of a table of queries: ``rmse_mean``, ``rmse_pooled``, ``median`` (px), nearest and shares.
+
+    And ``rmse_seen``, the mean over queries with a match that is seen, where the table has it.
+    """
     error = queries.rmse_px
+    seen = {"rmse_seen": queries.rmse_seen_px.mean()} if "rmse_seen_px" in queries else {}
     summary = {
         "rmse_mean": error.mean(),
         "rmse_pooled": np.sqrt(np.square(error).mean()),
@@ -115,6 +126,7 @@ def aggregate(queries: pd.DataFrame) -> dict[str, float]:
         "best_mean": queries.best_px.mean(),
         "swap_rate": queries.swapped.mean(),
         **{f"pck@{t}px": queries[f"pck@{t}px"].mean() for t in PCK_PX},
+        **seen,
     }
     return {name: round(float(value), 4) for name, value in summary.items()} | {"queries": len(queries)}
 

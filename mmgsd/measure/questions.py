@@ -52,8 +52,9 @@ def ask(
         frame[list(LISTS)] = None
         for n in np.unique(count):
             rows = np.flatnonzero(count == n)
-            true = data.xy[second][np.stack([orbits[r] for r in rows])].astype(float)
-            for column, values in compute_query_errors(means[rows, :n], covariances[rows, :n], true).items():
+            points_there = np.stack([orbits[r] for r in rows])
+            true, seen = data.xy[second][points_there].astype(float), data.visible[second][points_there]
+            for column, values in compute_query_errors(means[rows, :n], covariances[rows, :n], true, seen).items():
                 frame.loc[rows, column] = values
             lists = compute_mode_lists(means[rows, :n], covariances[rows, :n], weights[rows, :n], true)
             for column, values in lists.items():

@@ -1,4 +1,4 @@
-"""The heads' loss of a batch: it can be learnt, and leaves the descriptors to the method's own loss."""
+"""The losses of a batch: the heads' leaves descriptors to the method's own; SPCL's learns hidden matches if told so."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import torch
 from mmgsd.config import TrainConfig
 from mmgsd.dataset import Dataset, load_dataset
 from mmgsd.learn.augmentation import Batch, load_training_images, make_batch
-from mmgsd.learn.objective import compute_head_loss
+from mmgsd.learn.objective import compute_head_loss, compute_loss
 from mmgsd.model.network import build_network
 
 CONFIG = TrainConfig(input_px=64, descriptor_dim=8, heads=True, clutter=True, roles=2)
@@ -54,3 +54,20 @@ def test_a_batch_without_any_object_has_a_finite_loss(data: Dataset, batch: Batc
     loss = compute_head_loss(network.heads, network.describe(batch.image), empty, permutations, data.size,
                              torch.Generator().manual_seed(0))  # fmt: skip
     assert torch.isfinite(loss)
+
+
+def test_contrastive_losses_learn_hidden_matches_where_that_is_asked_for(data: Dataset, batch: Batch) -> None:
+    config = TrainConfig(method="spcl", margin=4.0, input_px=64, descriptor_dim=8, batch=4, pairs=6, queries=16)
+    descriptors = torch.randn(len(batch.image), 8, 16, 16, generator=torch.Generator().manual_seed(0))
+    permutations = torch.tensor(data.group().permutations)
+    batch.askable[1, ::2] = False  # they are inside the second image, but something hides them
+
+    def measure(hidden_matches: bool) -> float:
+        asked = dataclasses.replace(config, hidden_matches=hidden_matches)
+        return float(compute_loss(asked, descriptors, batch, permutations, data.size, 0))
+
+    assert measure(False) != measure(True)
+    batch.askable[:] = batch.inside
+    assert measure(False) == measure(True)
+    with pytest.raises(ValueError, match="hidden_matches must be False for 'mmgsd'"):
+        TrainConfig(method="mmgsd", hidden_matches=True)

@@ -98,7 +98,7 @@ def test_one_row_a_query_about_images_of_different_simulations(cloth_dataset: Pa
     queries = ask_baseline("centre", cloth_dataset, tmp_path / "centre.parquet")
     assert list(queries.columns) == [
         "pair", "image0", "image1", "point", "visible", "n", "entropy", "hidden", "outside", *LISTS,
-        "rmse_px", "nearest_px", "best_px", "swapped", "pck@5px", "pck@10px", "pck@20px",
+        "rmse_px", "nearest_px", "best_px", "swapped", "pck@5px", "pck@10px", "pck@20px", "rmse_seen_px",
     ]  # fmt: skip
     assert len(queries) == CONFIG.pairs * CONFIG.points
     assert not queries.duplicated(["pair", "point"]).any()

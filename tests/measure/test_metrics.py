@@ -50,6 +50,16 @@ def test_query_metrics_by_hand() -> None:
     })  # fmt: skip
 
 
+def test_errors_of_what_is_seen_leave_hidden_matches_out() -> None:
+    seen = np.array([[[True, False]], [[False, True]], [[False, False]], [[True, True]]])
+    errors = [compute_query_errors(MODES, COVARIANCES, TRUE, one)["rmse_seen_px"][0] for one in seen]
+    assert errors[:2] == pytest.approx([5.0, 8.0]) and np.isnan(errors[2])
+    assert errors[3] == pytest.approx(compute_query_errors(MODES, COVARIANCES, TRUE)["rmse_px"][0])
+    columns = {name: 1.0 for name in ("nearest_px", "best_px", "swapped", "pck@5px", "pck@10px", "pck@20px")}
+    queries = pd.DataFrame({"rmse_px": [3.0, 4.0], "rmse_seen_px": [2.0, np.nan], **columns})
+    assert aggregate(queries)["rmse_seen"] == 2.0
+
+
 def test_without_covariances_the_first_mode_is_the_best() -> None:
     metrics = compute_query_errors(MODES, np.full_like(COVARIANCES, np.nan), TRUE)
     assert metrics["best_px"][0] == metrics["nearest_px"][0] == 8.0

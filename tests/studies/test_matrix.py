@@ -40,24 +40,26 @@ def test_the_models_that_matter_most_come_first() -> None:
     steps = [m.steps for m in models]
     assert models[5] == configure_study(load_preset("paper"), "cloth", "budget")["mmgsd"]  # one model, two tables
     assert max(i for i, m in enumerate(models) if m.sigma_px == 16) == max(i for i, n in enumerate(steps) if n == 1000)
-    assert set(steps[4:30]) == {1000} and set(steps[30:42]) == {4000} and len(models) == 52
-    assert steps[42:52] == [12000] * 2 + [3000] * 4 + [12000] * 2 + [3500] * 2
+    assert set(steps[4:30]) == {1000} and set(steps[30:42]) == {4000} and len(models) == 54
+    assert steps[42:54] == [12000] * 2 + [3000] * 4 + [12000] * 2 + [4000] * 2 + [3500] * 2
     assert [m.trunk_weights for m in models[44:48]] == [m.name for m in models[42:46]]  # these are trained before
     assert len({m.name for m in models}) == len(models)
     assert {m.group for m in models if m.object == "cloth"} == {"c4", "v4", "d4"}
     assert sorted({m.sigma_px for m in models}) == [1.0, 2.0, 4.0, 8.0, 16.0]
     assert {m.seed for m in models} == {0}
     assert sum(m.method == "spcl" and m.dense_weight == 1.0 for m in models) == 8
+    assert sum(m.hidden_matches for m in models) == 2
     assert sum(m.method == "mmgsd" and m.dense_weight == 0.0 for m in models) == 8
 
 
 def test_seed_after_seed_the_same_models_are_repeated() -> None:
     preset = load_preset("paper")
     models = choose_tasks(preset, seeds=3)
-    assert [m.seed for m in models] == [0] * 10 + [1] * 10 + [2] * 10
-    assert models[:10] == [configure_model(preset, name, row.name) for row in list_rows("seeds") for name in OBJECTS]
-    of_budget = [configure_study(preset, name, "budget")[row.name] for row in list_rows("seeds") for name in OBJECTS]
-    assert choose_tasks(preset, seeds=1, steps=1000) == of_budget
+    assert [m.seed for m in models] == [0] * 14 + [1] * 14 + [2] * 14
+    assert models[:14] == [configure_model(preset, name, row.name) for row in list_rows("seeds") for name in OBJECTS]
+    of_budget = {m.name for name in OBJECTS for m in configure_study(preset, name, "budget").values()}
+    small = choose_tasks(preset, seeds=1, steps=1000)
+    assert {m.name for m in small if not m.hidden_matches} <= of_budget and {m.steps for m in small} == {1000}
 
 
 def test_errors_of_several_seeds_are_written(
@@ -66,11 +68,11 @@ def test_errors_of_several_seeds_are_written(
     preset = make_tiny(tiny_dataset, tmp_path)
     monkeypatch.setattr(matrix, "load_preset", lambda _: preset)
     monkeypatch.setattr(matrix, "find_root", lambda: tmp_path)
-    matrix.main("smoke", seeds=2, steps=1, only="cloth-mm")
+    matrix.main("smoke", seeds=2, steps=1, only="cloth-uni")
     written = tmp_path / "data" / "results" / "smoke" / "seeds_1.json"
     table = json.loads(written.read_text())
-    assert table.keys() == {"cloth"} and table["cloth"].keys() == {"mmgsd-0", "mmgsd-1"}
-    assert [table["cloth"][f"mmgsd-{seed}"]["run"]["seed"] for seed in (0, 1)] == [0, 1]
+    assert table.keys() == {"cloth"} and table["cloth"].keys() == {"unimodal-0", "unimodal-1"}
+    assert [table["cloth"][f"unimodal-{seed}"]["run"]["seed"] for seed in (0, 1)] == [0, 1]
     assert len({row["rmse_mean"] for row in table["cloth"].values()}) == 2
     assert not (written.parent / "rmse.json").exists()
     for file in (tmp_path / "data" / "generated" / "smoke" / "queries").iterdir():  # as on another machine
@@ -139,8 +141,8 @@ def test_results_are_written_of_what_is_done(tiny_dataset: Callable[..., Path], 
 
 def test_some_can_be_chosen_by_name(chosen: list[TrainConfig]) -> None:
     matrix.main("paper", only="rope-spcl")
-    assert [(m.object, m.method) for m in chosen] == [("rope", "spcl")] * 7
-    assert [m.steps for m in chosen] == [4000, 1000, 1000, 1000, 4000, 4000, 3500]
+    assert [(m.object, m.method) for m in chosen] == [("rope", "spcl")] * 8
+    assert [m.steps for m in chosen] == [4000, 1000, 1000, 1000, 4000, 4000, 4000, 3500]
     with pytest.raises(ValueError, match="--only 'shirt'"):
         matrix.main("paper", only="shirt")
 

@@ -117,7 +117,7 @@ def test_everything_that_a_figure_may_draw_has_a_colour_of_its_own() -> None:
 
 
 def test_methods_baselines_and_chance_have_rows() -> None:
-    assert {row.name for row in list_rows("seeds")} == {*METHODS, "spcl_dense"}
+    assert {row.name for row in list_rows("seeds")} == {*METHODS, "mmgsd_plain", "spcl_dense", "spcl_hidden"}
     assert tuple(row.name for row in list_rows("hand_made")) == BASELINES
     assert {row.name for row in list_rows("chance")} == set(CHANCE)
 
