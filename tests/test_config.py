@@ -51,7 +51,7 @@ def test_paper_preset_has_the_papers_sizes() -> None:
 
 
 def test_unknown_preset_names_the_accepted_ones() -> None:
-    with pytest.raises(ValueError, match="preset must be one of 'smoke', 'quick', 'paper'.*'paper'.*got 'papr'"):
+    with pytest.raises(ValueError, match="preset must .*got 'papr'"):
         load_preset("papr")
 
 
@@ -102,13 +102,13 @@ def test_an_object_may_have_any_name_that_is_free(kind: type, name: str) -> None
     "models", "queries", "notebooks", "sample", "experiments", "Models", "Cloth", "ROPE", "cloth-spcl", "rope-broken",
 ])  # fmt: skip
 def test_a_name_that_is_taken_is_refused(kind: type, name: str) -> None:
-    with pytest.raises(ValueError, match=f"object must be another name than .*'models'.* got '{name}'"):
+    with pytest.raises(ValueError, match=f"object must .*got '{name}'"):
         kind(object=name)
 
 
 @pytest.mark.parametrize("name", ["", "a b", "a/b", "../towel", "a.json", ".hidden", "-a", "2", "a\n", "ü", "a" * 61])
 def test_a_name_that_is_none_of_a_file_is_refused(name: str) -> None:
-    with pytest.raises(ValueError, match="object must be 'cloth', 'rope' or the name of a file in data/objects: up to"):
+    with pytest.raises(ValueError, match="object must"):
         RenderConfig(object=name)
 
 

@@ -98,7 +98,7 @@ def use_weights(folder: Path, damage: Callable[[bytes], bytes], dataset: Path, m
 
 def use_checkpoint(folder: Path, damage: Callable[[bytes], bytes], dataset: Path, model: Path) -> None:
     (folder / CHECKPOINT).write_bytes(damage((model / CHECKPOINT).read_bytes()))
-    with pytest.warns(UserWarning, match=f"{CHECKPOINT} is damaged, so it is made again"):
+    with pytest.warns(UserWarning, match=f"{CHECKPOINT} is damaged"):
         weights = train_model(CONFIG, dataset, folder, device="cpu", progress=False)
     ours, theirs = load_file(weights), load_file(model / WEIGHTS)
     assert all(torch.equal(ours[name], value) for name, value in theirs.items())
@@ -108,7 +108,7 @@ def use_table_of_answers(folder: Path, damage: Callable[[bytes], bytes], dataset
     out = evaluate_baseline("centre", dataset, ASKED, folder / "centre.parquet", progress=False)
     whole = load_queries(out)
     out.write_bytes(damage(out.read_bytes()))
-    warned = pytest.warns(UserWarning, match="centre.parquet is damaged, so it is made again")
+    warned = pytest.warns(UserWarning, match="centre.parquet is damaged")
     with nullcontext() if damage is flip else warned:  # a flipped bit may be in statistics that nobody reads
         evaluate_baseline("centre", dataset, ASKED, out, progress=False)
     pd.testing.assert_frame_equal(load_queries(out), whole)

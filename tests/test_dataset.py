@@ -208,7 +208,7 @@ def test_a_whole_data_set_passes_and_its_images_are_lossless(
 def test_groups_are_data(cloth_dataset: Path) -> None:
     data = load_dataset(cloth_dataset)
     assert (data.group().name, data.group().order, data.group("d4").order) == ("c4", 4, 8)
-    with pytest.raises(ValueError, match="group must be one of 'identity', .*got 'c3'"):
+    with pytest.raises(ValueError, match="group must .*got 'c3'"):
         data.group("c3")
 
 
@@ -226,7 +226,7 @@ def test_fingerprint_is_that_of_the_scenes(tiny_dataset: Callable[..., Path]) ->
 
 
 def test_what_is_not_there_is_named(cloth_dataset: Path, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="split must be one of 'train', 'test', got 'validation'"):
+    with pytest.raises(ValueError, match="split must .*got 'validation'"):
         load_dataset(cloth_dataset, "validation")
     with pytest.raises(FileNotFoundError, match="dataset.json does not exist"):
         load_dataset(tmp_path)

@@ -186,9 +186,9 @@ def test_a_wrong_ending_does_not_matter(tmp_path: Path, rng: np.random.Generator
 def test_what_is_no_file_is_named(tmp_path: Path) -> None:
     nowhere = tmp_path / "nowhere.png"
     for read in (read_image, to_rgb, lambda path: to_rgb(str(path)), lambda path: check_mask(path, (4, 4), "mask0")):
-        with pytest.raises(FileNotFoundError, match="nowhere.png does not exist: give the path"):
+        with pytest.raises(FileNotFoundError, match="nowhere.png does not exist"):
             read(nowhere)
-    with pytest.raises(ValueError, match=f"{tmp_path.name} is a folder: give the path"):
+    with pytest.raises(ValueError, match=f"{tmp_path.name} is a folder"):
         read_image(tmp_path)
 
 

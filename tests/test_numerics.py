@@ -150,8 +150,8 @@ def read_settings() -> tuple[Any, ...]:
 
 @pytest.mark.parametrize("device", ["cuda:99", "meta", "gpu", "cpu:x", 3.5])
 def test_a_device_that_is_not_here_is_named(question: Question, device: Any, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"device must be 'cpu'.*got"):
+    with pytest.raises(ValueError, match=r"device must"):
         load(question.weights, device=device)
-    with pytest.raises(ValueError, match=r"device must be 'cpu'.*got"):
+    with pytest.raises(ValueError, match=r"device must"):
         train_model(CONFIG, question.dataset, tmp_path, device=device, progress=False)
     assert not list(tmp_path.iterdir())

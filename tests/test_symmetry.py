@@ -141,5 +141,5 @@ def test_a_mirror_counts_a_cloths_columns_backwards_and_leaves_a_rope() -> None:
         group = load_group("cloth", name)
         for point in (0, 7, 130, 312):
             assert set(cloth[group.orbit(point)]) == set(group.orbit(cloth[point]))
-    with pytest.raises(ValueError, match="object must be one of 'cloth', 'rope', got 'towel'"):
+    with pytest.raises(ValueError, match="object must .*got 'towel'"):
         load_mirror("towel")

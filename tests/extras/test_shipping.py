@@ -54,17 +54,17 @@ def test_files_of_others_are_not_replaced(cloth_dataset: Path, tmp_path: Path) -
     weights = train_model(config, cloth_dataset, tmp_path / "model", progress=False)
     out = tmp_path / "cloth.safetensors"
     save_file({"a": np.zeros(3)}, out)
-    with pytest.raises(ForeignFileError, match="cloth.safetensors holds no weights of this project"):
+    with pytest.raises(ForeignFileError, match="cloth.safetensors holds no"):
         ship_model(weights, out, FACTS)
     out.unlink()
     out.with_suffix(".md").write_text("# Diary")
-    with pytest.raises(ForeignFileError, match="cloth.md is no card of cloth.safetensors"):
+    with pytest.raises(ForeignFileError, match="cloth.md is no"):
         ship_model(weights, out, FACTS)
     assert not out.exists()
     out.with_suffix(".md").unlink()
     shipped = ship_model(weights, out, FACTS)
     weights.write_bytes(weights.read_bytes()[:999])
-    with pytest.warns(UserWarning, match="weights.safetensors is damaged, so it is made again"):
+    with pytest.warns(UserWarning, match="weights.safetensors is damaged"):
         assert restore_model(shipped, weights.parent, config).read_bytes() == shipped.read_bytes()
     with locked(tmp_path / "model", "training"), pytest.raises(LockedError, match="model is in use"):
         restore_model(shipped, tmp_path / "model", config)

@@ -62,14 +62,14 @@ def test_nothing_agrees_with_no_modes() -> None:
 
 @pytest.mark.parametrize("asked", [ASKED[:1], ASKED[[0, 0]], ASKED[:0]])
 def test_one_place_tells_no_motion(asked: np.ndarray) -> None:
-    with pytest.raises(ValueError, match="asked must be at least two places"):
+    with pytest.raises(ValueError, match="asked must"):
         find_consensus(asked, np.zeros((len(asked), 4, 2)), np.ones((len(asked), 4)))
 
 
 def test_a_motion_is_fitted_by_least_squares(rng: np.random.Generator) -> None:
     fitted = fit_motion_to(ASKED, TRUTH.apply(ASKED))
     np.testing.assert_allclose([fitted.factor, fitted.shift], [TRUTH.factor, TRUTH.shift], atol=1e-9)
-    with pytest.raises(ValueError, match="source and target must be as many points"):
+    with pytest.raises(ValueError, match="source and target must"):
         fit_motion_to(ASKED[:1], ASKED[:1])
 
 

@@ -95,9 +95,9 @@ def test_points_are_where_the_picture_shows_them(first):
 def test_a_damaged_state_is_set_aside_and_made_again(first, tmp_path):
     job, path = {"edge": STARTS["edge"]}, tmp_path / "edge.npz"
     path.write_bytes(first["edge"].read_bytes()[:5000])
-    with pytest.raises(DamagedFileError, match="edge.npz is damaged or no state"):
+    with pytest.raises(DamagedFileError, match="edge.npz is damaged"):
         read_state(path)
-    with pytest.warns(UserWarning, match="edge.npz is damaged, so it is made again"):
+    with pytest.warns(UserWarning, match="edge.npz is damaged"):
         run(job, tmp_path)
     assert path.read_bytes() == first["edge"].read_bytes() and (tmp_path / "edge.npz.damaged").is_file()
     kept = path.stat().st_mtime_ns

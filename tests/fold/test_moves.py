@@ -58,7 +58,7 @@ def test_the_surest_modes_of_a_picture_are_those_of_each_pixel(data, demonstrati
     answer = answer_picture(matcher, demonstration, image, chosen=BEST)
     surest = matcher.match(look.image, image, look.asked).best().xy[: len(look.moves)]
     np.testing.assert_allclose(answer.moves[:, 0], surest)
-    with pytest.raises(ValueError, match="chosen must be one of 'agree', 'best', 'joint', got 'first'"):
+    with pytest.raises(ValueError, match="chosen must .*got 'first'"):
         answer_picture(matcher, demonstration, image, chosen="first")
 
 

@@ -130,11 +130,11 @@ def test_what_cannot_be_learnt_from_is_said(
         with pytest.raises(ValueError, match=message):
             go_on(write_marks(tmp_path, chosen), weights, cloth_dataset, out)
     monkeypatch.setattr("mmgsd.learn.photographs.OFF_OBJECT", 1.0)
-    with pytest.raises(ValueError, match="00006.webp must have marks on the object"):
+    with pytest.raises(ValueError, match="00006.webp must"):
         go_on(write_marks(tmp_path, entries), weights, cloth_dataset, out)
-    with pytest.raises(ValueError, match="folds must be 0 or at least 2, got 1"):
+    with pytest.raises(ValueError, match="folds must .*got 1"):
         go_on(photographs, weights, cloth_dataset, out, folds=1)
-    with pytest.raises(ValueError, match="out must be a path that ends with .safetensors"):
+    with pytest.raises(ValueError, match="out must"):
         go_on(photographs, weights, cloth_dataset, tmp_path / "mine.pt")
     assert not out.exists()
 
@@ -142,13 +142,13 @@ def test_what_cannot_be_learnt_from_is_said(
 def test_weights_of_one_match_are_refused(photographs: Path, cloth_dataset: Path, tmp_path: Path) -> None:
     config = dataclasses.replace(CONFIG, method="unimodal", heads=False)
     one = train_model(config, cloth_dataset, tmp_path / "model", device="cpu", progress=False)
-    with pytest.raises(ValueError, match="weights must be of a method that is taught all matches, got 'unimodal'"):
+    with pytest.raises(ValueError, match="weights must .*got 'unimodal'"):
         go_on(photographs, one, cloth_dataset, tmp_path / "mine.safetensors")
 
 
 def test_without_renders_nothing_is_learnt(photographs: Path, weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(adapting, "find_sample_sets", lambda kind: [])
-    with pytest.raises(FileNotFoundError, match="renders must be a data set of 'cloth'"):
+    with pytest.raises(FileNotFoundError, match="renders must"):
         go_on(photographs, weights, None, photographs.with_name("mine.safetensors"))
 
 

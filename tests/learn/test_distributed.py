@@ -83,7 +83,7 @@ def test_processes_of_one_machine_listen_on_loopback_alone(tmp_path: Path) -> No
 
 def test_groups_are_shared_evenly(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("WORLD_SIZE", "2")
-    with pytest.raises(ValueError, match="groups must be a multiple of the 2 processes, got 3"), joined(3, "cpu"):
+    with pytest.raises(ValueError, match="groups must .*got 3"), joined(3, "cpu"):
         pass
 
 

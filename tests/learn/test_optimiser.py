@@ -69,5 +69,5 @@ def test_muon_does_not_care_how_a_gradient_lies_in_memory() -> None:
 
 
 def test_muon_refuses_weights_that_it_would_copy() -> None:
-    with pytest.raises(ValueError, match="weights must lie in memory channels last, got strides"):
+    with pytest.raises(ValueError, match="weights must .*got strides"):
         ConvolutionMuon([nn.Parameter(torch.randn(8, 6, 3, 3))], lr=0.01, weight_decay=0.0)

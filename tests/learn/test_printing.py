@@ -119,5 +119,5 @@ def test_zoom_and_shift_reach_as_far_as_is_asked() -> None:
 
 
 def test_objects_of_ones_own_have_no_strong_augmentation() -> None:
-    with pytest.raises(ValueError, match="strong must be False for an object of your own"):
+    with pytest.raises(ValueError, match="strong must"):
         TrainConfig(object="flag", strong=True)

@@ -181,7 +181,7 @@ def test_a_baseline_takes_images_as_a_matcher_does(image):
 
 
 def test_an_unknown_baseline():
-    with pytest.raises(ValueError, match="method must be one of 'sift'.*got 'lift'"):
+    with pytest.raises(ValueError, match="method must .*got 'lift'"):
         BaselineMatcher("lift")
 
 
@@ -241,5 +241,5 @@ def test_other_features_are_refused(image, features, message):
 
 
 def test_an_extractor_is_a_function():
-    with pytest.raises(ValueError, match="extractor must be a function of an image, got 'dino'"):
+    with pytest.raises(ValueError, match="extractor must .*got 'dino'"):
         FeatureMatcher("dino")

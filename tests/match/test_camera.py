@@ -31,10 +31,10 @@ def test_intrinsics_are_a_matrix_its_numbers_or_four(given: object) -> None:
 @pytest.mark.parametrize("bad", [np.zeros((3, 3)), np.arange(9), np.eye(4), 5, (1, 2, 3), (0, 500, 242, 242), np.eye(2),
                                  (500, np.nan, 242, 242), (500, -500, 242, 242), np.diag([0, 5, 1])])  # fmt: skip
 def test_no_intrinsics(bad: object) -> None:
-    with pytest.raises(ValueError, match="intrinsics must be a 3 x 3 matrix .* or fx, fy, cx, cy"):
+    with pytest.raises(ValueError, match="intrinsics must"):
         compute_rays([1, 2], bad)
 
 
 def test_other_shapes() -> None:
-    with pytest.raises(ValueError, match=r"xy must have shape \(…, 2\), got \(3,\)"):
+    with pytest.raises(ValueError, match=r"xy must .*got \(3,\)"):
         compute_rays([1, 2, 3], INTRINSICS)

@@ -144,7 +144,7 @@ def test_hidden_matches_are_counted(cloth_dataset: Path, tmp_path: Path, monkeyp
 
 
 def test_unknown_baseline(cloth_dataset: Path, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="method must be one of .*'sift', 'orb', .*'centre', 'random'.*, got 'hog'"):
+    with pytest.raises(ValueError, match="method must .*got 'hog'"):
         ask_baseline("hog", cloth_dataset, tmp_path / "hog.parquet")
 
 
@@ -250,7 +250,7 @@ def test_of_further_modes_the_most_probable_one_is_the_answer(
     assert (own.n == 1).all() and np.allclose(own.rmse_px, own.nearest_px)
     assert (own.nearest_px >= every.nearest_px - 1e-6).all() and (own.nearest_px > every.nearest_px).any()
     assert not np.allclose(own.rmse_px, ask("mean", group="identity").rmse_px)
-    with pytest.raises(ValueError, match="modes must be at least 0, got -1"):
+    with pytest.raises(ValueError, match="modes must .*got -1"):
         ask("own", modes=-1)
 
 
@@ -264,7 +264,7 @@ def test_a_point_that_sticks_out_of_the_image_is_asked_at_its_border(cloth_datas
 def test_weights_of_another_object_are_refused(cloth_dataset: Path, tmp_path: Path, untrained: Path) -> None:
     matcher = evaluation.Matcher.load(untrained)
     matcher.object = "rope"
-    with pytest.raises(ValueError, match="weights must be of the object 'cloth' of .*, got weights of 'rope'"):
+    with pytest.raises(ValueError, match="weights must .*got weights of 'rope'"):
         evaluate_model(untrained, cloth_dataset, CONFIG, tmp_path / "out.parquet", progress=False)
     assert not (tmp_path / "out.parquet").exists()
     matcher.object = ""  # unknown
@@ -288,5 +288,5 @@ def test_answers_to_other_questions_are_not_compared(cloth_dataset: Path, tmp_pa
     tables = {method: ask_baseline(method, cloth_dataset, tmp_path / method) for method in ("centre", "random")}
     check_same_questions(tables)
     tables["random"] = tables["random"].assign(point=tables["random"].point + 1)
-    with pytest.raises(ValueError, match="tables must answer the same queries, got other ones of 'random' than of"):
+    with pytest.raises(ValueError, match="tables must .*got other ones of 'random' than of"):
         check_same_questions(tables)

@@ -254,5 +254,5 @@ def test_results_are_stored_under_a_name(tmp_path: Path, monkeypatch: pytest.Mon
     path = store_photographs({"queries": 3}, "mine")
     assert path == tmp_path / "data" / "results" / "photographs_mine.json"
     assert json.loads(path.read_text()) == {"queries": 3}
-    with pytest.raises(ValueError, match="name must be of letters, digits, - and _, got '../x'"):
+    with pytest.raises(ValueError, match="name must .*got '../x'"):
         store_photographs({}, "../x")

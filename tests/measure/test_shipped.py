@@ -160,5 +160,5 @@ def test_a_baseline_is_read_as_the_shipped_weights_are(root: Path, monkeypatch: 
 
 
 def test_modes_are_not_read_flatter_from_a_name_either(root: Path) -> None:
-    with pytest.raises(ValueError, match="exponent must be at least 1, got 0.5"):
+    with pytest.raises(ValueError, match="exponent must .*got 0.5"):
         measure_read("mine@0.5,1", root, progress=False)

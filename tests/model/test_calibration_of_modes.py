@@ -110,7 +110,7 @@ def test_some_queries_keep_the_calibration() -> None:
 @pytest.mark.parametrize("level", [0, 1, 1.5, np.nan, "0.9", True])
 @pytest.mark.parametrize("ask", [Match.radius_px, Match.ellipses])
 def test_what_is_no_level(ask: object, level: object) -> None:
-    with pytest.raises(ValueError, match="level must be a number greater than 0 and less than 1, got"):
+    with pytest.raises(ValueError, match="level must"):
         ask(answer(), level=level)
 
 

