@@ -5,7 +5,8 @@
 The test images of the presets `SETS` have to be rendered. A question is right where one member of the symmetry takes
 all its points to within `RADIUS_PX` of the chosen modes. Answers are chosen four ways: each point's heaviest mode; the
 best choice that the modes allow, for which one has to know the truth; the first joint answer (`mmgsd.match.joint`); and
-all joint answers, of which the share that is right counts.
+all joint answers, of which the share that is right counts. A fifth share says what sorting alone loses: the one of true
+matches, shuffled and sorted as modes are.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ import pandas as pd
 from mmgsd.command import Option
 from mmgsd.config import DEFAULT_GROUP, EvaluateConfig
 from mmgsd.dataset import Dataset, load_dataset
+from mmgsd.match.joint import PLACES, join
 from mmgsd.match.match import RADIUS_PX, Match
 from mmgsd.match.matcher import Matcher, find_weights
 from mmgsd.measure.evaluation import read_results, write_results
@@ -32,7 +34,7 @@ from mmgsd.progress import ProgressBar
 
 SETS = ("paper", "workspace")  # presets whose test images are asked about
 PAIRS, QUESTIONS, POINTS = 200, 3, 3  # pairs of images, questions about each, points of a question
-CHOSEN = ("heaviest", "possible", "joint", "any_joint")  # shares of right questions
+CHOSEN = ("heaviest", "possible", "joint", "any_joint", "true_modes")  # shares of right questions
 SWAPS = ("swaps_heaviest", "swaps_joint")  # shares of two right points of a question that belong to two members
 RESULTS = "joint.json"
 
@@ -61,7 +63,8 @@ def measure_joint(name: str, root: Path, *, pairs: int = PAIRS, progress: bool =
                 begun = time.perf_counter()
                 matches[joint] = matcher.match(*images, data.xy[first][points], joint=joint)
                 seconds[joint].append(time.perf_counter() - begun)
-            asked = judge_questions(data, second, points, matches[False], matches[True])
+            sorted_true = sort_true_matches(data, (first, second), points, np.random.default_rng([first, second]))
+            asked = judge_questions(data, second, points, matches[False], matches[True], sorted_true)
             found["all"] += asked
             found.setdefault(str(data.labels.state[second]), []).extend(asked)
         row[preset] = {kind: summarise_questions(asked) for kind, asked in sorted(found.items())}
@@ -70,24 +73,49 @@ def measure_joint(name: str, root: Path, *, pairs: int = PAIRS, progress: bool =
     return row | {"hardware": name_hardware(matcher.device)}
 
 
+def sort_true_matches(
+    data: Dataset, pair: tuple[int, int], points: np.ndarray, rng: np.random.Generator
+) -> np.ndarray:
+    """(S, n, 2) px, the true matches of material ``points`` (S,), shuffled and then sorted by `join`.
+
+    The places that it is helped by are further points that the first image shows.
+    """
+    first, second = pair
+    others = np.setdiff1d(np.flatnonzero(data.visible[first]), points)
+    places = rng.choice(others, min(PLACES, len(others)), replace=False)
+    asked = np.concatenate([points, places])
+    true = data.xy[second][_list_members(data)[:, asked].T].astype(float)  # (S + P, n, 2)
+    true = np.take_along_axis(true, rng.random(true.shape[:2]).argsort(1)[..., None], 1)
+    even = np.full(true.shape[:2], 1 / true.shape[1])
+    order = join(data.xy[first, asked].astype(float), data.load_mask(first), true, even, even, places=len(places))
+    return np.take_along_axis(true, order[..., None], 1)[: len(points)]
+
+
+def _list_members(data: Dataset) -> np.ndarray:
+    """(G, P) where each member of the symmetry takes the material points."""
+    return np.array(data.group(DEFAULT_GROUP.get(data.object, "")).permutations)
+
+
 def judge_questions(
-    data: Dataset, second: int, points: np.ndarray, alone: Match, joint: Match
+    data: Dataset, second: int, points: np.ndarray, alone: Match, joint: Match, sorted_true: np.ndarray
 ) -> list[dict[str, float]]:
     """Of each question of `POINTS` of material ``points`` (S,), whether the ways of `CHOSEN` are right; its swaps.
 
-    A measure that a question has not, NaN: swaps of fewer than two points that are right each by itself.
+    ``sorted_true`` are of `sort_true_matches`. A measure that a question has not, NaN: swaps of fewer than two points
+    that are right each by itself.
     """
-    members = np.array(data.group(DEFAULT_GROUP.get(data.object, "")).permutations)[:, points]
+    members = _list_members(data)[:, points]
     true = data.xy[second][members].astype(float)  # (G, S, 2)
-    near = {name: np.linalg.norm(match.modes[None] - true[:, :, None], axis=-1) < RADIUS_PX  # (G, S, n)
-            for name, match in (("alone", alone), ("joint", joint))}  # fmt: skip
+    ways = {"alone": alone.modes, "joint": joint.modes, "true": sorted_true}
+    near = {name: np.linalg.norm(modes[None] - true[:, :, None], axis=-1) < RADIUS_PX for name, modes in ways.items()}
     rows = []
     for start in range(0, len(points), POINTS):
-        one, all_ = (near[name][:, start : start + POINTS] for name in ("alone", "joint"))
+        one, all_, exact = (near[name][:, start : start + POINTS] for name in ways)  # (G, POINTS, n)
         rows.append({"heaviest": float(one[:, :, 0].all(1).any()),
                      "possible": float(one.any(2).all(1).any()),
                      "joint": float(all_[:, :, 0].all(1).any()),
                      "any_joint": float(all_.all(1).any(0).mean()),
+                     "true_modes": float(exact.all(1).any(0).mean()),
                      "swaps_heaviest": _measure_swaps(one[:, :, 0]),
                      "swaps_joint": _measure_swaps(all_[:, :, 0])})  # fmt: skip
     return rows

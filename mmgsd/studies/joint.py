@@ -15,8 +15,8 @@ from mmgsd.studies.shipped import SETS
 from mmgsd.studies.table import Table, make_page_table, say_value
 
 HEADS = {"heaviest": "right: heaviest modes", "joint": "first joint answer", "any_joint": "mean of joint answers",
-         "possible": "best choice of modes", "swaps_heaviest": "swaps: heaviest modes",
-         "swaps_joint": "first joint answer"}  # fmt: skip
+         "possible": "best choice of modes", "true_modes": "true matches, sorted",
+         "swaps_heaviest": "swaps: heaviest modes", "swaps_joint": "first joint answer"}  # fmt: skip
 
 
 def run(paths: Paths, *, names: Sequence[str] = OBJECTS) -> Path:
@@ -29,14 +29,15 @@ def run(paths: Paths, *, names: Sequence[str] = OBJECTS) -> Path:
 
 def describe_joint(rows: Mapping[str, Mapping[str, Any]]) -> Table:
     """Shares of right questions and of swaps, a row an object and set, clean ones by image1's state."""
-    lines = {}
+    lines, known = {}, {name for row in rows.values() for preset in SETS for name in row.get(preset, {}).get("all", {})}
+    heads = {name: head for name, head in HEADS.items() if name in known}
     for row in rows.values():
         for preset, word in SETS.items():
             for kind, said in row.get(preset, {}).items():
                 if kind == "all" or preset == next(iter(SETS)):  # states of clean images alone
                     label = f"{row['object']}, {word}" + ("" if kind == "all" else f", {kind}")
-                    lines[label] = [say_value(said, name, 100, ".0f", " %") for name in HEADS]
-    return make_page_table(list(HEADS.values()), lines)
+                    lines[label] = [say_value(said, name, 100, ".0f", " %") for name in heads]
+    return make_page_table(list(heads.values()), lines)
 
 
 def make_joint_sentence(rows: Mapping[str, Mapping[str, Any]]) -> str:

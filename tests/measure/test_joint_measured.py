@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mmgsd.dataset import load_dataset
 from mmgsd.measure import joint
 from mmgsd.measure.joint import CHOSEN, SWAPS, _measure_swaps, main, summarise_questions
 
@@ -18,6 +19,17 @@ def test_two_points_that_no_member_explains_together_are_swapped() -> None:
     near = np.array([[True, False, True], [False, True, True]])  # (members, points)
     assert _measure_swaps(near) == pytest.approx(1 / 3)  # the first two; the third goes with either
     assert np.isnan(_measure_swaps(near[:, :1]))
+
+
+def test_true_matches_are_sorted_as_modes_are(cloth_dataset: Path) -> None:
+    data, points = load_dataset(cloth_dataset, "test"), np.array([26, 300, 401, 598])
+    found = joint.sort_true_matches(data, (0, 1), points, np.random.default_rng(0))
+    true = data.xy[1][np.array(data.group().permutations)[:, points]].transpose(1, 0, 2)  # (S, n, 2)
+    assert found.shape == true.shape
+    for mine, theirs in zip(found, true, strict=True):  # another order of the same matches
+        assert sorted(map(tuple, mine)) == sorted(map(tuple, theirs.astype(float)))
+    right = np.abs(found[None] - data.xy[1][np.array(data.group().permutations)[:, points], None]).max(-1) < 1e-3
+    assert right.all(1).any(0).all()  # of a flat cloth each column is one member's
 
 
 def test_a_summary_leaves_out_what_questions_have_not() -> None:
