@@ -41,7 +41,8 @@ def test_the_smoke_experiment_runs_from_any_folder_draws_every_figure_and_ends_w
     assert "Nothing is learnt in smoke" in done.stdout and " numbers agree with the stored ones" in done.stdout
     assert list(json.loads((ROOT / "data" / "results" / "smoke" / "stages.json").read_text())) == stages
     drawn = {path.name for path in (ROOT / "figures" / "smoke").iterdir()}
-    names = ("teaser", "combined", "rmse_pdf", "spatial_rmse", "sigma_ablation", "risk_coverage", "calibration")
+    names = ("teaser", "combined", "rmse_pdf", "spatial_rmse", "sigma_ablation", "sigma_pdf", "risk_coverage",
+             "calibration")  # fmt: skip
     assert {f"{name}.{kind}" for name in names for kind in ("pdf", "png")} <= drawn
     rendered = ROOT / "data" / "generated" / "smoke" / "cloth" / "dataset.json"
     before = rendered.stat()

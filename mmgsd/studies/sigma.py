@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 
 from mmgsd.config import OBJECTS, TrainConfig, load_preset
 from mmgsd.figures.style import COLUMN_IN, finish_axes, styled
-from mmgsd.measure.evaluation import read_results
+from mmgsd.measure.evaluation import load_queries, read_results, write_results
 from mmgsd.paths import Paths
 from mmgsd.studies.claims import Claim, get, is_better, say
+from mmgsd.studies.main import compute_density
 from mmgsd.studies.matrix import run_each, train_and_ask, write_study_table
 from mmgsd.studies.models import configure_study, get_colour, vary_sigma
 from mmgsd.studies.parameters import check_training
@@ -24,6 +26,7 @@ from mmgsd.studies.registry import ERROR_MEASURES, Results, Shown, Study
 from mmgsd.studies.table import ERRORS, Table, collect_rows
 
 OTHER_SEED = re.compile(r"mmgsd-[1-9]")
+BIN_PX, SMOOTH_PX, SHOWN = 4, 5.0, 0.99  # of the errors' distributions: bins, their smoothing, the share that is drawn
 
 
 def list_models(preset: str, sigmas_px: Sequence[float] = (), *, steps: int = 0) -> list[TrainConfig]:
@@ -39,11 +42,23 @@ def check(paths: Paths, *, sigmas_px: Sequence[float] = (), steps: int = 0, over
 
 
 def run(paths: Paths, *, sigmas_px: Sequence[float] = (), steps: int = 0, overwrite: bool = False) -> Path:
-    """Train and ask each model; sigma.json, or of other ``steps`` sigma_4000.json."""
+    """Train and ask each model; sigma.json, or of other ``steps`` sigma_4000.json, and `count_errors` beside it."""
     models = {model.name: model for model in list_models(paths.preset, sigmas_px, steps=steps)}
     dict(run_each(partial(train_and_ask, paths=paths, overwrite=overwrite), models, desc="models"))
     write_study_table(load_preset(paths.preset), paths.root, "sigma", values=sigmas_px, steps=steps)
-    return list_shown(paths, steps=steps)[0]
+    shown = list_shown(paths, steps=steps)[0]
+    count_errors(paths, models.values(), shown.with_name(f"errors_by_{shown.name}"))
+    return shown
+
+
+def count_errors(paths: Paths, models: Iterable[TrainConfig], file: Path) -> Path:
+    """Write {object: {σ: [queries in each bin of `BIN_PX` of the error]}}, of queries with a visible source."""
+    counts = read_results(file, depth=1)
+    for model in models:
+        queries = load_queries(paths.queries(model.name))
+        bins = (queries[queries.visible].rmse_px.to_numpy(float) // BIN_PX).astype(int)
+        counts.setdefault(model.object, {})[f"{model.sigma_px:g}"] = np.bincount(bins).tolist()
+    return write_results(counts, file)
 
 
 def list_shown(paths: Paths, *, steps: int = 0, **_: Any) -> list[Path]:
@@ -113,11 +128,34 @@ def plot_sigma_ablation(
     return finish_axes(figure)
 
 
+def draw_densities(folder: Path) -> Figure | None:
+    """`plot_densities` of a preset's results; None where they have no distributions."""
+    counts = read_results(folder / "errors_by_sigma.json", depth=1)
+    return plot_densities(counts) if counts else None
+
+
+@styled
+def plot_densities(counts: Mapping[str, Mapping[str, Sequence[int]]]) -> Figure:
+    """Probability density of MMGSD's error, a line a σ of its targets: ``counts`` of `count_errors`."""
+    figure, axes = plt.subplots(1, len(counts), figsize=(COLUMN_IN, 1.9), layout="constrained", squeeze=False)
+    for axis, (name, rows) in zip(axes[0], counts.items(), strict=True):
+        widths, far = sorted(rows, key=float), 0.0
+        for shade, width in zip(np.linspace(0.0, 0.85, len(widths)), widths, strict=True):
+            values = np.array(rows[width])
+            density = compute_density(values, BIN_PX, bandwidth=SMOOTH_PX)
+            axis.plot(*density, color=plt.get_cmap("viridis")(shade), lw=1, label=f"σ = {width} px")
+            far = max(far, BIN_PX * (1 + float(np.searchsorted(values.cumsum(), SHOWN * values.sum()))))
+        axis.set(title=name.capitalize(), xlabel="Error (px)", xlim=(0, far), ylim=(0, None))
+    axes[0, 0].set_ylabel("Density per px")
+    axes[0, -1].legend(fontsize=6)
+    return finish_axes(figure)
+
+
 STUDY = Study(
     "sigma", 20, run, check, "05_sigma_ablation", ("sigma",), list_shown,
     tables={
         "sigma": Shown("paper/sigma.json", describe_sigma, "sigma_table"),
         "sigma_4000": Shown("paper/sigma_4000.json", describe_sigma),
     },
-    figures={"sigma_ablation": draw_sigma}, claims=(judge_sigma,), compared=ERROR_MEASURES,
+    figures={"sigma_ablation": draw_sigma, "sigma_pdf": draw_densities}, claims=(judge_sigma,), compared=ERROR_MEASURES,
 )  # fmt: skip
