@@ -5,7 +5,8 @@
 
 A round renders its clean and its cluttered images, with seeds of its own, trains on them and leaves its weights as
 ``data/weights/cloth-round2.safetensors``, from which the next one goes on: of the rounds before nothing else is needed.
-Its errors on simulations held out from it are kept in data/results/rounds.json.
+Its errors on simulations held out from it are kept in data/results/rounds.json. These are few: how well the weights of
+the round before do on all of its images, which they never saw, is kept beside them.
 """
 
 from __future__ import annotations
@@ -16,18 +17,22 @@ from typing import Annotated, Any
 import pandas as pd
 
 from mmgsd.command import Option
-from mmgsd.config import OBJECTS, ROUNDS, load_preset
+from mmgsd.config import OBJECTS, ROUNDS, TrainConfig, load_preset
+from mmgsd.dataset import load_parts
 from mmgsd.extras.shipping import ship_model
 from mmgsd.files import write_json
 from mmgsd.learn.checkpoints import LOG
 from mmgsd.learn.training import train_model
+from mmgsd.match.matcher import load
 from mmgsd.measure.evaluation import read_results
+from mmgsd.measure.questions import measure_rmse
 from mmgsd.model.tensors import describe_run
 from mmgsd.paths import Paths, find_root
 from mmgsd.scene.stage import render_dataset
 from mmgsd.studies.models import configure_study
 
 VALIDATIONS = 8  # of a round
+PAIRS, POINTS = 200, 60  # of images that were not seen, and material points asked about
 RESULTS = "rounds.json"  # in data/results
 
 
@@ -51,7 +56,8 @@ def run_round(root: Path, object: str, number: int, *, workers: int = 0) -> Path
     paths, model = Paths(root, preset.name), configure_study(preset, object, "rounds")[f"round{number}"]
     data = render_round(root, object, number, workers=workers)
     weights = train_model(model, data, paths.model(model), validate_every=model.steps // VALIDATIONS)
-    _keep_curve(root, object, number, weights)
+    unseen = measure_unseen(_find_file(root, object, number - 1), data, model) if number > 1 else {}
+    _keep_curve(root, object, number, weights, unseen)
     facts = {"preset": preset.name, "data_seed": number, "measured": {}}
     return ship_model(weights, _find_file(root, object, number), facts)
 
@@ -60,13 +66,20 @@ def _find_file(root: Path, object: str, number: int) -> Path:
     return root / "data" / "weights" / f"{object}-round{number}.safetensors"
 
 
-def _keep_curve(root: Path, object: str, number: int, weights: Path) -> None:
-    """Add a round's errors and cost to the results."""
+def measure_unseen(weights: Path, data: Path, model: TrainConfig) -> dict[str, float]:
+    """The error (px) of weights on all training images of a later round, clean and cluttered ones."""
+    matcher, parts = load(weights), load_parts(data, "train", also=model.also)
+    errors = [round(measure_rmse(matcher, part, pairs=PAIRS, points=POINTS), 2) for part in parts]
+    return dict(zip(("clean", "cluttered"), errors, strict=False))
+
+
+def _keep_curve(root: Path, object: str, number: int, weights: Path, unseen: dict[str, float]) -> None:
+    """Add a round's errors and cost to the results, and those of the weights before, to which it was ``unseen``."""
     file = root / "data" / "results" / RESULTS
     rows: dict[str, Any] = read_results(file, depth=2)
     log = pd.read_csv(weights.with_name(LOG)).dropna(subset="rmse_px")
     curve = {str(step): rmse for step, rmse in zip(log.step, log.rmse_px, strict=True)}
-    rows.setdefault(object, {})[str(number)] = {"rmse_px": curve, "run": describe_run(weights)}
+    rows.setdefault(object, {})[str(number)] = {"rmse_px": curve, "run": describe_run(weights), "before": unseen}
     write_json(file, {name: dict(sorted(rows[name].items())) for name in OBJECTS if name in rows})
 
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from mmgsd.config import ROUNDS, load_preset
 from mmgsd.extras import rounds
+from mmgsd.learn import training
 from mmgsd.match import matcher
 from mmgsd.match.matcher import load
 from mmgsd.studies.models import configure_study
@@ -30,6 +32,8 @@ def root(cloth_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
     monkeypatch.setattr(rounds, "configure_study", configure)
     monkeypatch.setattr(rounds, "render_dataset", render)
+    monkeypatch.setattr(training, "measure_rmse", partial(training.measure_rmse, pairs=2, points=9))
+    monkeypatch.setattr(rounds, "PAIRS", 2)
     monkeypatch.setattr(matcher, "find_shipped", lambda: tmp_path / "data" / "weights")
     return tmp_path
 
@@ -44,7 +48,8 @@ def test_a_round_goes_on_from_the_one_before(root: Path, monkeypatch: pytest.Mon
     assert rounds.find_round(root, "cloth") == 2
     stored = json.loads((root / "data" / "results" / "rounds.json").read_text())["cloth"]
     assert list(stored) == ["1", "2"]
-    assert len(stored["2"]["rmse_px"]) == rounds.VALIDATIONS
+    assert list(stored["2"]["rmse_px"]) == [str(step) for step in range(1, 9)]
+    assert stored["1"]["before"] == {} and 0 < stored["2"]["before"]["clean"] < 485
     assert stored["2"]["run"]["model"] == load(second).config.name
 
     monkeypatch.setattr(rounds, "find_root", lambda: root)
