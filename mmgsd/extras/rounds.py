@@ -5,8 +5,8 @@
 
 A round renders its clean and its cluttered images, with seeds of its own, trains on them and leaves its weights as
 ``data/weights/cloth-round2.safetensors``, from which the next one goes on: of the rounds before nothing else is needed.
-Its errors on simulations held out from it are kept in data/results/rounds.json. These are few: how well the weights of
-the round before do on all of its images, which they never saw, is kept beside them.
+Its errors on simulations held out from it are kept in data/results/rounds.json. These are few: beside them stand the
+errors on all of its images, of the weights ``before``, which never saw them, and of those ``after``, trained on them.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from mmgsd.scene.stage import render_dataset
 from mmgsd.studies.models import configure_study
 
 VALIDATIONS = 8  # of a round
-PAIRS, POINTS = 200, 60  # of images that were not seen, and material points asked about
+PAIRS, POINTS = 200, 60  # of all of a round's images, and material points asked about
 RESULTS = "rounds.json"  # in data/results
 
 
@@ -56,8 +56,9 @@ def run_round(root: Path, object: str, number: int, *, workers: int = 0) -> Path
     paths, model = Paths(root, preset.name), configure_study(preset, object, "rounds")[f"round{number}"]
     data = render_round(root, object, number, workers=workers)
     weights = train_model(model, data, paths.model(model), validate_every=model.steps // VALIDATIONS)
-    unseen = measure_unseen(_find_file(root, object, number - 1), data, model) if number > 1 else {}
-    _keep_curve(root, object, number, weights, unseen)
+    files = {"before": _find_file(root, object, number - 1), "after": weights}
+    errors = {name: measure_images(file, data, model) for name, file in files.items() if file.is_file()}
+    _keep_curve(root, object, number, weights, errors)
     facts = {"preset": preset.name, "data_seed": number, "measured": {}}
     return ship_model(weights, _find_file(root, object, number), facts)
 
@@ -66,20 +67,20 @@ def _find_file(root: Path, object: str, number: int) -> Path:
     return root / "data" / "weights" / f"{object}-round{number}.safetensors"
 
 
-def measure_unseen(weights: Path, data: Path, model: TrainConfig) -> dict[str, float]:
-    """The error (px) of weights on all training images of a later round, clean and cluttered ones."""
+def measure_images(weights: Path, data: Path, model: TrainConfig) -> dict[str, float]:
+    """The error (px) of weights on all training images of a round, clean and cluttered ones."""
     matcher, parts = load(weights), load_parts(data, "train", also=model.also)
     errors = [round(measure_rmse(matcher, part, pairs=PAIRS, points=POINTS), 2) for part in parts]
     return dict(zip(("clean", "cluttered"), errors, strict=False))
 
 
-def _keep_curve(root: Path, object: str, number: int, weights: Path, unseen: dict[str, float]) -> None:
-    """Add a round's errors and cost to the results, and those of the weights before, to which it was ``unseen``."""
+def _keep_curve(root: Path, object: str, number: int, weights: Path, errors: dict[str, dict[str, float]]) -> None:
+    """Add a round's curve, its cost, and the ``errors`` before and after it to the results."""
     file = root / "data" / "results" / RESULTS
     rows: dict[str, Any] = read_results(file, depth=2)
     log = pd.read_csv(weights.with_name(LOG)).dropna(subset="rmse_px")
     curve = {str(step): rmse for step, rmse in zip(log.step, log.rmse_px, strict=True)}
-    rows.setdefault(object, {})[str(number)] = {"rmse_px": curve, "run": describe_run(weights), "before": unseen}
+    rows.setdefault(object, {})[str(number)] = {"rmse_px": curve, "run": describe_run(weights), **errors}
     write_json(file, {name: dict(sorted(rows[name].items())) for name in OBJECTS if name in rows})
 
 

@@ -31,6 +31,7 @@ def root(tmp_path: Path, cloth_dataset: Path, monkeypatch: pytest.MonkeyPatch) -
         monkeypatch.setattr(module, "load_preset", lambda _: small)
     monkeypatch.setattr(study, "OBJECTS", ("cloth",))
     monkeypatch.setattr(shipped, "TIMED", 1)
+    monkeypatch.setattr(shipped, "HEAD_PAIRS", 4)
     monkeypatch.setenv("MMGSD_ROOT", str(tmp_path))
     weights = write_weights(tmp_path)
     monkeypatch.setattr(shipped, "find_weights", lambda _: weights)

@@ -47,6 +47,14 @@ def start(folder: Path, workers: int, scheduler: str = "", temporary: Path | Non
     return subprocess.Popen(command, env=env, start_new_session=True)
 
 
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What `CONFIG` gives where nothing happens, for all tests to compare with: read it only."""
+    folder = tmp_path_factory.mktemp("stage") / "undisturbed"
+    assert start(folder, 2).wait(300) == 0
+    return folder
+
+
 def read_tree(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
@@ -70,9 +78,8 @@ def test_every_image_is_planned_once_and_splits_share_no_simulation() -> None:
         assert [e for e, _ in episodes] == list(range(len(episodes)))
 
 
-def test_a_killed_rendering_goes_on_and_ends_with_the_same_bytes(tmp_path: Path) -> None:
-    whole, killed = tmp_path / "whole", tmp_path / "killed"
-    assert start(whole, 2).wait(300) == 0
+def test_a_killed_rendering_goes_on_and_ends_with_the_same_bytes(undisturbed: Path, tmp_path: Path) -> None:
+    killed = tmp_path / "killed"
     process = start(killed, 1)
     partial = tmp_path / "killed.partial"
     wait_for(lambda: list(partial.glob("*.zip")))
@@ -81,15 +88,16 @@ def test_a_killed_rendering_goes_on_and_ends_with_the_same_bytes(tmp_path: Path)
     kept = {path.name: path.stat().st_mtime_ns for path in partial.glob("*.zip")}
     assert kept and not killed.exists()
     assert start(killed, 1).wait(300) == 0
-    assert read_tree(whole) == read_tree(killed)
+    assert read_tree(undisturbed) == read_tree(killed)
     assert check_dataset(killed).images.to_list() == [3, 2]
     with pytest.raises(ValueError, match="seed: 5 there, 6 asked for"):
         render_dataset(dataclasses.replace(CONFIG, seed=6), killed)
 
 
-def test_test_images_alone_are_those_of_the_whole_data_set_and_the_rest_can_follow(tmp_path: Path) -> None:
-    whole, folder = (tmp_path / name for name in ("whole", "alone"))
-    render_dataset(CONFIG, whole, progress=False)
+def test_test_images_alone_are_those_of_the_whole_set_and_the_rest_can_follow(
+    undisturbed: Path, tmp_path: Path
+) -> None:
+    whole, folder = undisturbed, tmp_path / "alone"
     assert render_dataset(CONFIG, folder, only_test=True, progress=False) == folder
     assert check_dataset(folder).images.to_dict() == {"test": 2}
     alone, all_of_them = load_dataset(folder, "test"), load_dataset(whole, "test")
@@ -103,10 +111,9 @@ def test_test_images_alone_are_those_of_the_whole_data_set_and_the_rest_can_foll
     assert len(load_dataset(folder, "train")) == 3 and not (tmp_path / "alone.partial").exists()
 
 
-def test_a_lost_worker_of_a_foreign_cluster_costs_nothing_but_time(tmp_path: Path) -> None:
+def test_a_lost_worker_of_a_foreign_cluster_costs_nothing_but_time(undisturbed: Path, tmp_path: Path) -> None:
     """The scheduler is given by its address; one of its workers is killed while it renders."""
-    undisturbed, disturbed = tmp_path / "undisturbed", tmp_path / "disturbed"
-    assert start(undisturbed, 1).wait(300) == 0
+    disturbed = tmp_path / "disturbed"
     how = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
     with unchanged_environment(), LocalCluster(n_workers=2, threads_per_worker=1, **how) as cluster:
         first = {worker.pid for worker in cluster.workers.values()}
