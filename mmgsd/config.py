@@ -129,7 +129,7 @@ class TrainConfig:
     roundness: float = _later(ROUNDNESS)  # of the modes read from heatmaps, a priori (`mmgsd.match.mixture.fit_modes`)
     heads: bool = _later(False)  # it also learns where the object is, what is seen, whether it is there (`learn.heads`)
     clutter: bool = _later(False)  # augmentation changes backgrounds and puts things in front (`learn.compositing`)
-    strong: bool = _later(False)  # augmentation also prints the object anew and zooms and shifts further
+    strong: bool = _later(False)  # augmentation also gives the object other textures, zooms and shifts further
     also: str = _later("")  # preset whose images of the object are trained on besides the data set's own, or ""
     seed: int = 0
 
@@ -162,7 +162,8 @@ class TrainConfig:
         allowed = not self.hidden_matches or self.method in CONTRASTIVE
         check("hidden_matches", self.hidden_matches, f"False for {self.method!r}, which always learns them", allowed)
         if self.strong:
-            check("strong", self.strong, "False for an object of your own", self.object in OBJECTS)
+            accepted = "False for an object of your own, or without augment"
+            check("strong", self.strong, accepted, self.object in OBJECTS and self.augment)
         if self.also:
             check_choice("also", self.also, tuple(PRESETS))
 
@@ -258,7 +259,7 @@ PRESETS = {
 }  # fmt: skip
 for _number in range(1, ROUNDS + 1):
     _clean, _cluttered = f"round{_number}", f"round{_number}_workspace"
-    # what was learnt by heart was simulations, of which more are drawn since
+    # a round's own images have less error than new ones: later rounds draw more simulations, and fewer views of each
     _round = {**ROUND, "seed": _number, "views": {"cloth": 5 if _number < 4 else 2, "rope": 10 if _number < 3 else 1}}
     PRESETS[_clean] = _preset(_clean, **_round, cluttered=_cluttered)
     PRESETS[_cluttered] = _preset(_cluttered, **_round, scene="workspace")

@@ -195,7 +195,7 @@ class _Job:
         self.stops = [round(steps * k / STOPS) for k in range(STOPS + 1)]
         self.config = dataclasses.replace(
             config, steps=steps, seed=asked["seed"], learning_rate=RATE, optimiser="adamw", schedule="cosine",
-            groups=1, sigma_px=SIGMA_PX, sigma_start_px=SIGMA_PX, augment=True, strong=False,  # own prints stay
+            groups=1, sigma_px=SIGMA_PX, sigma_start_px=SIGMA_PX, augment=True, strong=False,  # own textures stay
         )  # fmt: skip
 
     def measure(self) -> list[dict[int, Found]]:

@@ -17,13 +17,13 @@ from torch import Tensor
 from mmgsd.config import TrainConfig
 from mmgsd.dataset import Dataset
 from mmgsd.learn.compositing import composite, disturb, fill_object
-from mmgsd.learn.printing import print_object
+from mmgsd.learn.texturing import retexture
 from mmgsd.model.network import compute_input_size
 
 CACHE_SCALE = 1.25  # images are kept in memory at this multiple of the network's input size
 SHIFT, SCALE = 0.06, 0.2  # the most that an image is moved, of its size, and the log of its zoom
 STRONG_SHIFT, STRONG_SCALE = 0.15, 0.35  # where augmentation is strong: objects are cut off by the image's border
-PRINTED = 0.5  # share of the images whose object is printed anew then
+RETEXTURED = 0.5  # share of the images whose object has another texture then
 WAVES = 4  # that bend an image
 BEND_ITERATIONS = 12
 
@@ -164,7 +164,7 @@ def make_batch(
     """Augment the images ``indices`` (B,), labels with them, and move them to the device.
 
     Half of them are mirrored where the object has a mirror image; with ``config.clutter`` they are also put together
-    anew (`mmgsd.learn.compositing`), with ``config.strong`` printed anew (`mmgsd.learn.printing`).
+    anew (`mmgsd.learn.compositing`), with ``config.strong`` retextured (`mmgsd.learn.texturing`).
     """
     made = [_make_one(images, int(index), config, rng) for index in indices]
     image, mask, xy, visible, present = (np.stack(values) for values in zip(*made, strict=True))
@@ -191,12 +191,12 @@ def _make_one(images: TrainingImages, index: int, config: TrainConfig, rng: np.r
     else:
         image, mask = warp_images(planes, warp, images.size, size)
     xy = warp.move(xy)
-    if config.strong and present and rng.random() < PRINTED:
+    if config.strong and present and rng.random() < RETEXTURED:
         there = rescale(xy, images.size, size)
-        image = print_object(image, mask, there, visible, config.object, lambda: _borrow(images, rng), rng)
+        image = retexture(image, mask, there, visible, config.object, lambda: _borrow(images, rng), rng)
     if config.clutter:
         beside = not config.strong or config.object == "rope"
-        made = composite(image, mask, lambda: _borrow(images, rng), rng, sheets_beside=beside)
+        made = composite(image, mask, lambda: _borrow(images, rng), rng, lookalikes_beside=beside)
         image, mask, present = made.image, made.mask, present and made.present
         visible = visible & ~_look_up(made.covered, xy, images.size) & present
     image = jitter_colours(image, rng) if config.augment else image

@@ -36,17 +36,17 @@ class Picture:
 
 def composite(
     image: np.ndarray, mask: np.ndarray, borrow: Callable[[], tuple[np.ndarray, np.ndarray]],
-    rng: np.random.Generator, *, sheets_beside: bool = True,
+    rng: np.random.Generator, *, lookalikes_beside: bool = True,
 ) -> Picture:  # fmt: skip
     """Give an image (h, w, 3) uint8 with its object's ``mask`` (h, w) uint8 another background, things and occluders.
 
     ``borrow`` draws another image with its mask, of any size. What happens is up to ``rng``, see the constants. Without
-    ``sheets_beside`` nothing as large as a cloth lies beside the object, only under it: which of two is the cloth?
+    ``lookalikes_beside`` nothing as large as a cloth lies beside the object, only under it: which of two is the cloth?
     """
     present, replaced = rng.random() >= REMOVED, rng.random() < REPLACED
     if replaced or not present:
         ground = _draw_ground(image.shape[:2], borrow, rng)
-        under = None if sheets_beside or not present else mask
+        under = None if lookalikes_beside or not present else mask
         draw_things(ground, rng, int(rng.integers(THINGS)), size=(0.15, 1.1) if present else (0.05, 0.3), under=under)
         image, mask = (_paste(ground, image, mask, rng), mask) if present else (ground, np.zeros_like(mask))
     covered = np.zeros(mask.shape, bool)
@@ -63,8 +63,8 @@ def draw_things(
 ) -> np.ndarray:  # fmt: skip
     """Draw sheets, boxes, discs and bars with soft shadows into ``image`` (h, w, 3) uint8, in place.
 
-    Their sides are ``size`` of the image's longer side. Of an object that will lie ``under`` this mask (h, w) uint8,
-    those that look like it and lie beside it are left out. Returns where they lie, (h, w) bool.
+    Their sides are ``size`` of the image's longer side. ``under`` is the mask (h, w) uint8 of an object that
+    will be laid on top: things as large that would lie beside it are left out. Returns where they lie, (h, w) bool.
     """
     covered = np.zeros(image.shape[:2], bool)
     for _ in range(count):

@@ -87,7 +87,8 @@ def sort_true_matches(
     true = data.xy[second][_list_members(data)[:, asked].T].astype(float)  # (S + P, n, 2)
     true = np.take_along_axis(true, rng.random(true.shape[:2]).argsort(1)[..., None], 1)
     even = np.full(true.shape[:2], 1 / true.shape[1])
-    order = join(data.xy[first, asked].astype(float), data.load_mask(first), true, even, even, places=len(places))
+    xy, spread = data.xy[first, asked].astype(float), np.ones_like(even)
+    order = join(xy, data.load_mask(first), true, even, spread, places=len(places))
     return np.take_along_axis(true, order[..., None], 1)[: len(points)]
 
 

@@ -1,10 +1,10 @@
-"""What the large errors are: every true match by what may explain its error, and what no method could know.
+"""What the large errors are: every true match by what may explain its error, and what outlines leave open.
 
     python -m mmgsd run tail --preset round2 --set weights=cloth --set split=train    -> data/results/tail.json
 
 Half of all error is in a few queries. A true match has the first cause of `CAUSES` that applies to it. Beside the
-measured errors stands the least that an answer by the outline alone has: where a turn or a mirror image of the outline
-is the outline itself, a fold may lie either way round (`find_outline_symmetries`). Shading and hems tell more.
+measured errors stands that of the better way round where the outline alone decides: where a turn or a mirror image of
+the outline is the outline itself, a fold may lie either way round (`find_outline_symmetries`). Shading tells more.
 """
 
 from __future__ import annotations
@@ -152,7 +152,7 @@ def find_outline_symmetries(mask: np.ndarray) -> list[np.ndarray]:
 def measure_floors(data: Dataset, config: EvaluateConfig, group: str) -> pd.DataFrame:
     """A row a target image of the questions: its ``state``, how many ways round ``ways``, and ``floor_px``.
 
-    The floor is the least mean RMSE that one answer has over the ways that its outline leaves open, each as likely:
+    The floor is the mean RMSE of the best of these ways over all that the outline leaves open, each as likely:
     under a mirror image the points are those of the mirrored object.
     """
     points, symmetry = choose_points(config.points, data.n_points), data.group(group)
@@ -207,6 +207,7 @@ def summarise_tail(matches: pd.DataFrame, floors: pd.DataFrame) -> dict[str, dic
 
 def _summarise(rows: pd.DataFrame, every: pd.DataFrame, tail: pd.DataFrame, total: float) -> dict[str, float]:
     def root_mean(errors: pd.Series) -> float | None:
+        """The root mean square, None of nothing."""
         return round(float(np.sqrt(np.square(errors).mean())), 2) if len(errors) else None
 
     return {

@@ -1,6 +1,6 @@
-"""Another print on the object of a training image: pictures, patches, letters and borders that lie on its surface.
+"""Another texture on the object of a training image: pictures, patches, letters and borders that lie on its surface.
 
-A rendered data set has as many prints as simulations, other people's towels have any. Where each pixel lies on the
+A rendered data set has as many textures as simulations, other people's towels have any. Where each pixel lies on the
 surface is interpolated between the material points that are seen, and the shading of the image is kept.
 """
 
@@ -15,10 +15,10 @@ from scipy.spatial import cKDTree
 
 from mmgsd.learn.compositing import crop, draw_colour, draw_things, fill_area
 
-TEXTURE_PX = 160  # side of a print
+TEXTURE_PX = 160  # side of a texture
 KINDS = ("picture", "filled", "patches", "motifs", "plain")
 SHARES = {"cloth": (0.2, 0.15, 0.25, 0.3, 0.1), "rope": (0.05, 0.35, 0.1, 0.0, 0.5)}  # of the kinds
-FRAMED = 0.4  # share of a cloth's prints with a border
+FRAMED = 0.4  # share of a cloth's textures with a border
 BRIGHT = 80  # percentile of an object's grey values that is taken for its colour under full light
 DARKEST, BRIGHTEST = 0.15, 1.3  # of the shading
 GLYPHS = [chr(code) for code in range(33, 127)]
@@ -26,19 +26,19 @@ GLYPHS = [chr(code) for code in range(33, 127)]
 Borrow = Callable[[], tuple[np.ndarray, np.ndarray]]
 
 
-def lay_flat(object: str, points: int) -> np.ndarray:
-    """(P, 2) in [0, 1], where the material points lie on a print: on a cloth row by row, on a rope along its middle."""
+def place_on_texture(object: str, points: int) -> np.ndarray:
+    """(P, 2) in [0, 1], where material points lie on a texture: on a cloth row by row, on a rope along its middle."""
     if object == "rope":
         return np.stack([np.linspace(0, 1, points), np.full(points, 0.5)], axis=-1)
     rows, columns = np.divmod(np.arange(points), side := round(points**0.5))
     return np.stack([columns, rows], axis=-1) / (side - 1)
 
 
-def print_object(
+def retexture(
     image: np.ndarray, mask: np.ndarray, xy: np.ndarray, visible: np.ndarray, object: str, borrow: Borrow,
     rng: np.random.Generator,
 ) -> np.ndarray:  # fmt: skip
-    """The image (h, w, 3) uint8 with another print on the object under ``mask`` (h, w) uint8.
+    """The image (h, w, 3) uint8 with another texture on the object under ``mask`` (h, w) uint8.
 
     ``xy`` (P, 2) are px of this image, ``visible`` (P,) bool; with fewer than four of them seen it stays as it is.
     ``borrow`` draws another image with its mask.
@@ -46,8 +46,8 @@ def print_object(
     rows, columns = mask.nonzero()
     if visible.sum() < 4 or not len(rows):
         return image
-    places = _lay_on(mask, xy[visible], lay_flat(object, len(xy))[visible], object)
-    texture = draw_print(object, borrow, rng)
+    places = _lay_on(mask, xy[visible], place_on_texture(object, len(xy))[visible], object)
+    texture = draw_texture(object, borrow, rng)
     colours = cv2.remap(texture, places * (TEXTURE_PX - 1), None, cv2.INTER_LINEAR)[rows, columns]
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)[rows, columns].astype(np.float32)
     full = max(16.0, float(np.percentile(grey, BRIGHT)))
@@ -59,10 +59,10 @@ def print_object(
     return printed
 
 
-def draw_print(object: str, borrow: Borrow, rng: np.random.Generator) -> np.ndarray:
+def draw_texture(object: str, borrow: Borrow, rng: np.random.Generator) -> np.ndarray:
     """A square picture (T, T, 3) uint8."""
     shape = TEXTURE_PX, TEXTURE_PX
-    shares = SHARES.get(object, SHARES["cloth"])
+    shares = SHARES[object]
     kind = str(rng.choice(KINDS, p=shares))
     if kind == "picture":
         texture = crop(borrow()[0], shape, rng)
@@ -80,7 +80,7 @@ def draw_print(object: str, borrow: Borrow, rng: np.random.Generator) -> np.ndar
 
 
 def _lay_on(mask: np.ndarray, xy: np.ndarray, flat: np.ndarray, object: str) -> np.ndarray:
-    """(h, w, 2) float32 in [0, 1], where each pixel of a ``mask`` lies on the print: every second one, then between."""
+    """(h, w, 2) float32 in [0, 1], where each pixel of a ``mask`` lies on the texture: every second, then between."""
     height, width = mask.shape
     small = cv2.resize(mask, (-(-width // 2), -(-height // 2)), interpolation=cv2.INTER_AREA)
     small = cv2.dilate(small, np.ones((3, 3)))
@@ -91,7 +91,7 @@ def _lay_on(mask: np.ndarray, xy: np.ndarray, flat: np.ndarray, object: str) -> 
 
 
 def _interpolate(xy: np.ndarray, flat: np.ndarray, places: np.ndarray, object: str) -> np.ndarray:
-    """(K, 2) in [0, 1], where ``places`` (K, 2) px lie on the print; beyond the points seen, where the nearest does."""
+    """(K, 2) in [0, 1], where ``places`` (K, 2) px lie on the texture; beyond points seen, where the nearest does."""
     _, nearest = cKDTree(xy).query(places)
     found = flat[nearest]
     if object != "rope" and np.linalg.matrix_rank(xy - xy.mean(0), tol=1.0) == 2:

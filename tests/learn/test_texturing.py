@@ -11,10 +11,10 @@ import torch
 
 from mmgsd.config import TrainConfig
 from mmgsd.dataset import load_dataset
-from mmgsd.learn import augmentation, printing
+from mmgsd.learn import augmentation, texturing
 from mmgsd.learn.augmentation import Warp, make_batch, sample_warp, warp_images
 from mmgsd.learn.compositing import composite, draw_things
-from mmgsd.learn.printing import draw_print, lay_flat, print_object
+from mmgsd.learn.texturing import draw_texture, place_on_texture, retexture
 
 SHAPE = (96, 128)
 
@@ -25,7 +25,7 @@ def cloth() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     mask = np.zeros(SHAPE, np.uint8)
     mask[20:81, 30:91] = 255
     image = np.where(mask[..., None] > 0, np.uint8([150, 150, 150]), np.uint8([200, 0, 0]))
-    return image, mask, lay_flat("cloth", 625) * 60 + (30, 20)
+    return image, mask, place_on_texture("cloth", 625) * 60 + (30, 20)
 
 
 def borrow() -> tuple[np.ndarray, np.ndarray]:
@@ -33,7 +33,7 @@ def borrow() -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_points_lie_on_a_print_as_they_do_on_the_object() -> None:
-    cloth, rope = lay_flat("cloth", 625), lay_flat("rope", 625)
+    cloth, rope = place_on_texture("cloth", 625), place_on_texture("rope", 625)
     assert cloth[[0, 24, 600, 624]].tolist() == [[0, 0], [1, 0], [0, 1], [1, 1]]
     assert rope[[0, 312, 624], 0].tolist() == [0, 0.5, 1] and (rope[:, 1] == 0.5).all()
 
@@ -41,11 +41,11 @@ def test_points_lie_on_a_print_as_they_do_on_the_object() -> None:
 def test_a_print_follows_the_surface_and_keeps_the_shading(cloth, rng, monkeypatch) -> None:
     image, mask, xy = cloth
     image[mask > 0] = np.where(np.arange(SHAPE[1])[None, :, None] < 60, 75, 150).repeat(SHAPE[0], 0)[mask > 0]
-    ramp = np.zeros((printing.TEXTURE_PX, printing.TEXTURE_PX, 3), np.uint8)
-    ramp[..., 0], ramp[..., 1] = np.linspace(0, 200, printing.TEXTURE_PX), 100  # red grows along the rows
-    monkeypatch.setattr(printing, "draw_print", lambda *_: ramp)
+    ramp = np.zeros((texturing.TEXTURE_PX, texturing.TEXTURE_PX, 3), np.uint8)
+    ramp[..., 0], ramp[..., 1] = np.linspace(0, 200, texturing.TEXTURE_PX), 100  # red grows along the rows
+    monkeypatch.setattr(texturing, "draw_texture", lambda *_: ramp)
     turned = np.rot90(xy.reshape(25, 25, 2)).reshape(-1, 2)  # its rows run down the image
-    printed = print_object(image, mask, turned, np.ones(625, bool), "cloth", borrow, rng).astype(int)
+    printed = retexture(image, mask, turned, np.ones(625, bool), "cloth", borrow, rng).astype(int)
     assert (printed[mask == 0] == image[mask == 0]).all()
     assert printed[24, 80, 0] < 20 < 150 < printed[78, 80, 0]
     dark, light = printed[50, 45, 1], printed[50, 75, 1]
@@ -56,25 +56,25 @@ def test_hidden_points_do_not_count_and_with_too_few_the_image_stays(cloth, rng)
     image, mask, xy = cloth
     visible = np.zeros(625, bool)
     visible[:3] = True
-    assert print_object(image, mask, xy, visible, "cloth", borrow, rng) is image
+    assert retexture(image, mask, xy, visible, "cloth", borrow, rng) is image
     xy[3:] = np.nan
     visible[:3] = False
-    assert print_object(image, mask, xy, visible, "cloth", borrow, rng) is image
-    assert print_object(image, 0 * mask, xy, ~visible, "cloth", borrow, rng) is image
+    assert retexture(image, mask, xy, visible, "cloth", borrow, rng) is image
+    assert retexture(image, 0 * mask, xy, ~visible, "cloth", borrow, rng) is image
 
 
 @pytest.mark.parametrize("object", ["cloth", "rope"])
 def test_points_on_a_line_can_be_printed_on(cloth, rng, object: str) -> None:
     image, mask, _ = cloth
     line = np.stack([np.linspace(30, 90, 625), np.full(625, 50.0)], -1)
-    printed = print_object(image, mask, line, np.ones(625, bool), object, borrow, rng)
+    printed = retexture(image, mask, line, np.ones(625, bool), object, borrow, rng)
     assert printed.shape == image.shape and (printed[mask == 0] == image[mask == 0]).all()
 
 
 @pytest.mark.parametrize("object", ["cloth", "rope"])
 def test_prints_are_pictures_of_many_kinds_that_the_generator_decides(object: str) -> None:
-    prints = [draw_print(object, borrow, np.random.default_rng(seed)) for seed in range(40)]
-    again = draw_print(object, borrow, np.random.default_rng(7))
+    prints = [draw_texture(object, borrow, np.random.default_rng(seed)) for seed in range(40)]
+    again = draw_texture(object, borrow, np.random.default_rng(7))
     assert all(p.shape == (160, 160, 3) and p.dtype == np.uint8 for p in prints)
     assert (again == prints[7]).all()
     assert len({p.tobytes() for p in prints}) > 35
@@ -88,7 +88,7 @@ def test_a_sheet_like_the_object_lies_under_it_or_not_at_all(cloth) -> None:
         if covered.sum() > 0.25 * (mask > 0).sum():
             counts.append((covered & (mask > 0)).sum() / (mask > 0).sum())
     assert len(counts) > 5 and min(counts) >= 0.5
-    beside = [composite(image, mask, borrow, np.random.default_rng(s), sheets_beside=False).image for s in range(5)]
+    beside = [composite(image, mask, borrow, np.random.default_rng(s), lookalikes_beside=False).image for s in range(5)]
     assert all(made.shape == image.shape for made in beside)
 
 
