@@ -17,7 +17,8 @@ import numpy as np
 import pandas as pd
 import torch
 
-from mmgsd.config import EvaluateConfig, load_preset
+from mmgsd.checks import check
+from mmgsd.config import OBJECTS, EvaluateConfig, load_preset
 from mmgsd.dataset import Dataset, load_dataset
 from mmgsd.match.matcher import Matcher, load
 from mmgsd.measure.evaluation import read_results, write_results
@@ -49,6 +50,7 @@ CAUSES = {
 def run(paths: Paths, *, weights: str = "cloth", split: str = "test") -> Path:
     """Ask one model about a preset's images and the cluttered ones that go with them; tail.json."""
     matcher, file = load(weights), paths.results.parent / RESULTS
+    check("weights", weights, f"of {' or '.join(OBJECTS)}", matcher.object in OBJECTS)
     for preset in (paths.preset, load_preset(paths.preset).cluttered):
         data = load_dataset(Paths(paths.root, preset).dataset(matcher.object), split)
         found = summarise_tail(list_matches(matcher, data), measure_floors(data, QUESTIONS, matcher.config.group))
