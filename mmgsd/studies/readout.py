@@ -17,17 +17,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mmgsd.config import EvaluateConfig, load_preset
-from mmgsd.dataset import Dataset, load_dataset
-from mmgsd.match.matcher import QUARTERS, Matcher, load, read_heatmap
+from mmgsd.config import EvaluateConfig
+from mmgsd.dataset import Dataset
+from mmgsd.match.matcher import QUARTERS, Matcher, read_heatmap
 from mmgsd.match.mixture import AS_IT_IS, Mixture
-from mmgsd.measure.evaluation import read_results, write_results
 from mmgsd.measure.metrics import aggregate
 from mmgsd.measure.questions import AnswerFunction, ask, choose_points, draw_pairs
 from mmgsd.model.heads import Outputs
 from mmgsd.model.network import compute_cell_centres
 from mmgsd.paths import Paths
 from mmgsd.progress import ProgressBar
+from mmgsd.studies.by_weights import list_parts, list_rows, measure_weights
 from mmgsd.studies.registry import Results, Shown, Study
 from mmgsd.studies.table import ERRORS, Table
 
@@ -61,14 +61,7 @@ WAYS = {
 
 def run(paths: Paths, *, weights: str = "cloth", split: str = "test") -> Path:
     """Ask one model in every way about a preset's images and the cluttered ones that go with them; readout.json."""
-    matcher, file = load(weights), paths.results.parent / RESULTS
-    for preset in (paths.preset, load_preset(paths.preset).cluttered):
-        data = load_dataset(Paths(paths.root, preset).dataset(matcher.object), split)
-        found = measure_ways(matcher, data)
-        rows = read_results(file, depth=3)
-        rows.setdefault(weights, {})[preset] = found
-        write_results(rows, file)
-    return file
+    return measure_weights(paths, RESULTS, weights, split, measure_ways)
 
 
 def measure_ways(
@@ -138,10 +131,8 @@ def _make_answer(
 
 def describe_ways(results: Results) -> Table:
     """The errors of every way, a row each; weights and their images beside each other."""
-    parts = {f"{weights}, {images}": rows for weights, every in results.items() for images, rows in every.items()}
-    rows = {way.label: {part: found[name] for part, found in parts.items() if name in found}
-            for name, way in WAYS.items()}  # fmt: skip
-    return Table("read", {"": ERRORS}, {label: row for label, row in rows.items() if row}, list(parts))
+    labels = {name: way.label for name, way in WAYS.items()}
+    return Table("read", {"": ERRORS}, list_rows(results, labels), list(list_parts(results)))
 
 
 STUDY = Study(

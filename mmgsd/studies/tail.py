@@ -9,7 +9,6 @@ the outline is the outline itself, a fold may lie either way round (`find_outlin
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 
 import cv2
@@ -18,14 +17,14 @@ import pandas as pd
 import torch
 
 from mmgsd.checks import check
-from mmgsd.config import OBJECTS, EvaluateConfig, load_preset
-from mmgsd.dataset import Dataset, load_dataset
-from mmgsd.match.matcher import Matcher, load
-from mmgsd.measure.evaluation import read_results, write_results
+from mmgsd.config import OBJECTS, EvaluateConfig
+from mmgsd.dataset import Dataset
+from mmgsd.match.matcher import Matcher
 from mmgsd.measure.metrics import compute_mode_errors
 from mmgsd.measure.questions import choose_points, describe, draw_pairs, read_modes
 from mmgsd.paths import Paths
 from mmgsd.progress import ProgressBar
+from mmgsd.studies.by_weights import list_parts, list_rows, measure_weights
 from mmgsd.studies.registry import Results, Shown, Study
 from mmgsd.studies.table import Column, Table
 
@@ -49,15 +48,13 @@ CAUSES = {
 
 def run(paths: Paths, *, weights: str = "cloth", split: str = "test") -> Path:
     """Ask one model about a preset's images and the cluttered ones that go with them; tail.json."""
-    matcher, file = load(weights), paths.results.parent / RESULTS
-    check("weights", weights, f"of {' or '.join(OBJECTS)}", matcher.object in OBJECTS)
-    for preset in (paths.preset, load_preset(paths.preset).cluttered):
-        data = load_dataset(Paths(paths.root, preset).dataset(matcher.object), split)
-        found = summarise_tail(list_matches(matcher, data), measure_floors(data, QUESTIONS, matcher.config.group))
-        rows = read_results(file, depth=3)
-        rows.setdefault(weights, {})[preset] = found
-        write_results(rows, file)
-    return file
+    return measure_weights(paths, RESULTS, weights, split, measure_tail)
+
+
+def measure_tail(matcher: Matcher, data: Dataset) -> Results:
+    """What large errors are, and what outlines leave open; ValueError for weights of an object of one's own."""
+    check("weights", matcher.object, f"of {' or '.join(OBJECTS)}", matcher.object in OBJECTS)
+    return summarise_tail(list_matches(matcher, data), measure_floors(data, QUESTIONS, matcher.config.group))
 
 
 def list_matches(matcher: Matcher, data: Dataset, *, config: EvaluateConfig = QUESTIONS) -> pd.DataFrame:
@@ -227,7 +224,7 @@ def describe_tail(results: Results) -> Table:
         Column("tail", page="of the tail's squared error", form=".0f", scale=100),
         Column("seen_px", page="RMS error, seen, px"), Column("hidden_px", page="hidden, px"),
     ]  # fmt: skip
-    return Table("cause", {"": columns}, _list_rows(results, {"all": "all", **CAUSES}), _name_parts(results))
+    return Table("cause", {"": columns}, list_rows(results, {"all": "all", **CAUSES}), list(list_parts(results)))
 
 
 def describe_floors(results: Results) -> Table:
@@ -235,20 +232,9 @@ def describe_floors(results: Results) -> Table:
     columns = [Column("images", page="images", form="d"),
                Column("ways", page="outline fits more than one way round", form=".0f", scale=100),
                Column("floor_px", page="least error by the outline alone, px")]  # fmt: skip
-    keys = {key: key.removeprefix("floor: ") for parts in results.values() for found in parts.values()
-            for key in found if key.startswith("floor: ")}  # fmt: skip
-    return Table("state", {"": columns}, _list_rows(results, keys), _name_parts(results))
-
-
-def _name_parts(results: Results) -> list[str]:
-    return [f"{weights}, {images}" for weights, every in results.items() for images in every]
-
-
-def _list_rows(results: Results, labels: Mapping[str, str]) -> dict[str, dict[str, Results]]:
-    """{label: {part: what it found}} of the keys that some part has."""
-    parts = {f"{weights}, {images}": found for weights, every in results.items() for images, found in every.items()}
-    rows = {label: {part: found[key] for part, found in parts.items() if key in found} for key, label in labels.items()}
-    return {label: row for label, row in rows.items() if row}
+    keys = {key: key.removeprefix("floor: ") for found in list_parts(results).values() for key in found
+            if key.startswith("floor: ")}  # fmt: skip
+    return Table("state", {"": columns}, list_rows(results, keys), list(list_parts(results)))
 
 
 STUDY = Study(
