@@ -18,6 +18,7 @@ import torch
 from mmgsd.config import DEFAULT_GROUP, IMAGE_SIZE
 from mmgsd.dataset_format import FORMAT
 from mmgsd.images import encode_image, encode_mask
+from mmgsd.learn import training
 from mmgsd.model import dinov2
 from mmgsd.model.tensors import write_tensors
 from mmgsd.symmetry import GRID_GROUPS, LINE_GROUPS, load_group, load_mirror
@@ -56,6 +57,15 @@ def backbone(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[], 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(dinov2, "find_backbone", find)
         yield published
+
+
+@pytest.fixture(scope="session", autouse=True)
+def few_questions() -> Iterator[None]:
+    """Training asks a few questions where it validates itself and looks for a bandwidth: most of its time here."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("measure_rmse", "calibrate_bandwidth"):
+            patch.setattr(training, name, partial(getattr(training, name), pairs=2, points=9))
+        yield
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from typing import Annotated
 
 import pytest
 
-from mmgsd.__main__ import COMMANDS, STUDIES, make_parser
+from mmgsd.__main__ import COMMANDS, STUDIES, main, make_parser
 from mmgsd.command import Option, add_arguments, call, run_command
 
 LATER = "brings it (Python 3.11 or later)"
@@ -79,12 +79,23 @@ def test_the_traceback_is_to_be_had(monkeypatch):
         ("reproduce papr", "argument preset: invalid choice: 'papr'"),
     ],
 )
-def test_every_command_says_what_is_wrong_without_a_traceback(tmp_path, command, sentence):
-    environment = {**os.environ, "MMGSD_ROOT": str(tmp_path), "PYTHONPATH": str(ROOT), "MMGSD_TRACEBACK": ""}
-    asked = [sys.executable, "-m", "mmgsd", *command.split()]
+def test_every_command_says_what_is_wrong_without_a_traceback(tmp_path, monkeypatch, capsys, command, sentence):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MMGSD_ROOT", str(tmp_path))
+    monkeypatch.delenv("MMGSD_TRACEBACK", raising=False)
+    with pytest.raises(SystemExit) as stopped:
+        main(command.split())
+    told = capsys.readouterr().err
+    assert stopped.value.code == 2
+    assert sentence in told and "Traceback" not in told
+
+
+def test_the_module_is_a_command(tmp_path):
+    asked = [sys.executable, "-m", "mmgsd", "latex", "papr"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "MMGSD_TRACEBACK": ""}
     done = subprocess.run(asked, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300)
     assert done.returncode == 2
-    assert sentence in done.stderr and "Traceback" not in done.stderr
+    assert "error: preset must be one of" in done.stderr and "Traceback" not in done.stderr
 
 
 @pytest.mark.parametrize("words", [[name] for name in COMMANDS] + [["run", name] for name in STUDIES], ids=" ".join)

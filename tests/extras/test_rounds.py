@@ -5,14 +5,12 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
-from functools import partial
 from pathlib import Path
 
 import pytest
 
 from mmgsd.config import ROUNDS, load_preset
 from mmgsd.extras import rounds
-from mmgsd.learn import training
 from mmgsd.match import matcher
 from mmgsd.match.matcher import load
 from mmgsd.studies.models import configure_study
@@ -32,7 +30,6 @@ def root(cloth_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
     monkeypatch.setattr(rounds, "configure_study", configure)
     monkeypatch.setattr(rounds, "render_dataset", render)
-    monkeypatch.setattr(training, "measure_rmse", partial(training.measure_rmse, pairs=2, points=9))
     monkeypatch.setattr(rounds, "PAIRS", 2)
     monkeypatch.setattr(matcher, "find_shipped", lambda: tmp_path / "data" / "weights")
     return tmp_path
