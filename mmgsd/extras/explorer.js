@@ -6,11 +6,12 @@ const PART_BYTES = 4 << 20; // of a file a message: Jupyter's servers close the 
 const MOST_BYTES = 100 << 20;
 const RESTING_SHARE = 0.68; // of the window's height, for the pictures
 const TOGETHER = "One turn or flip of the object for all points, of the answers beside (a; b for the next)";
+const FLAT = "Ask for places of the object, laid flat on the left, instead of an image's pixels (l)";
 const PARTS = { heatmap: "h", modes: "m", "true matches": "t" };
 const HELP = [["click, drag", "ask"], ["shift + click", "pin"], ["ctrl + wheel", "zoom"], ["alt + drag", "move"],
   ["p", "previous"], ["r", "random"], ["n", "next"], ["h", "heatmap"], ["m", "modes"], ["t", "true matches"],
   ["v", "move or ask"], ["+", "closer"], ["-", "farther"], ["0", "fit"], ["c", "clear"], ["f", "full screen"],
-  ["a", "points together"], ["b", "next answer"],
+  ["a", "points together"], ["b", "next answer"], ["l", "laid flat"],
   ["s", "save picture"], ["j", "save JSON"],
   ["k", "save marks"]];
 
@@ -55,7 +56,8 @@ class Explorer {
         group(make("span", { className: "mmgsd-word", textContent: "method" }), this.method),
         group(...Object.values(this.toggles)),
         group(this.joiner, this.answers),
-        group(step("previous", "p"), step("random", "r"), step("next", "n"), this.count)),
+        group(step("previous", "p"), step("random", "r"), step("next", "n"),
+          button("laid flat", FLAT, () => this.send({ do: "flat" })), this.count)),
       make("div", { className: "mmgsd-bar" },
         group(this.mover,
           button("−", "Farther (-)", () => this.zoom(1 / 1.5)),
@@ -226,7 +228,7 @@ class Explorer {
       p: step("previous"), r: step("random"), n: step("next"), v: () => this.setMoving(!this.moving),
       "+": () => this.zoom(1.5), "=": () => this.zoom(1.5), "-": () => this.zoom(1 / 1.5), 0: () => this.fit(),
       c: () => this.send({ do: "clear" }), f: () => this.toggleScreen(),
-      a: () => this.join(), b: () => this.choose(this.chosen + 1),
+      a: () => this.join(), l: () => this.send({ do: "flat" }), b: () => this.choose(this.chosen + 1),
       s: () => this.savePicture(), j: () => this.saveJson(), k: () => this.saveMarks(),
       ...Object.fromEntries(Object.entries(PARTS).map(([part, key]) => [key, () => this.toggle(part)])),
     }[event.key.toLowerCase()];

@@ -32,6 +32,7 @@ from mmgsd.images import decode_image
 from mmgsd.match.baselines import FeatureMatcher
 from mmgsd.match.describe import describe_answer
 from mmgsd.match.match import Match
+from mmgsd.match.matcher import Matcher
 from mmgsd.measure.photographs import describe_marks
 from mmgsd.studies.models import get_label
 
@@ -150,6 +151,8 @@ class Explorer:
     def _mark(self) -> None:
         """Take what is pinned for the marked places of the left image; they stay when another is opened."""
         file, kind = self.scene.name0, getattr(self.matchers[self.pictures.method], "object", "")
+        if self.scene.flat:
+            return  # no photograph
         self.marks.pop(file, None)
         if self.pins:
             self.marks[file] = describe_marks(file, self.pins, kind)
@@ -157,7 +160,16 @@ class Explorer:
 
     def open_own(self, side: int, image: np.ndarray, name: str) -> None:
         """Show the user's image as the left (0) or right (1) one beside what is there; a pair after all others."""
-        scene = self.scene.replace_image(side, image, name)
+        self._open_beside(self.scene.replace_image(side, image, name))
+
+    def lay_flat(self) -> None:
+        """Show the object laid flat for the left image: a click asks for a place, as `Matcher.find` does.
+
+        ValueError where the chosen method does not know the object's places.
+        """
+        self._open_beside(self.scene.lay_flat(self._get_trained("laid flat").lay_flat()))
+
+    def _open_beside(self, scene: Scene) -> None:
         if self._own is None:
             self._own = len(self.scenes)
             self.scenes.append(scene)
@@ -179,21 +191,34 @@ class Explorer:
 
     def _check_together(self) -> bool:
         """Whether all points are to be answered together; ValueError, in the page's words, where the method cannot."""
+        if not self.pictures.together:
+            return False
+        if not self.scene.flat and not self._get_trained("together").config.heads:
+            raise ValueError(f"together must be off for {get_label(self.pictures.method, short=True)}, which has not "
+                             "learnt where the object is: choose another method")  # fmt: skip
+        return True
+
+    def _get_trained(self, what: str) -> Matcher:
+        """The chosen method; ValueError, in the page's words, where it is a hand-made one."""
         name, matcher = self.pictures.method, self.matchers[self.pictures.method]
-        if self.pictures.together and (isinstance(matcher, FeatureMatcher) or not matcher.config.heads):
-            raise ValueError(f"together must be off for {get_label(name, short=True)}, which has not learnt where the "
-                             "object is: choose another method")  # fmt: skip
-        return self.pictures.together
+        if isinstance(matcher, FeatureMatcher):
+            raise ValueError(f"{what} must be off for {get_label(name, short=True)}, which has learnt nothing of the "
+                             "object: choose another method")  # fmt: skip
+        return matcher
 
     def _get_answering(self) -> Callable[..., Match]:
         """The chosen method, its descriptors of this pair computed once."""
         name = self.pictures.method
         if name not in self._prepared:
             matcher, scene = self.matchers[name], self.scene
-            baseline = isinstance(matcher, FeatureMatcher)
-            self._prepared[name] = (
-                prepare_baseline(matcher, scene) if baseline else matcher.prepare(scene.image0, scene.image1).match
-            )
+            if scene.flat:
+                flat = self._get_trained("laid flat").lay_flat()
+                answer = matcher.prepare(None, scene.image1).lay_beside(flat).match
+            elif isinstance(matcher, FeatureMatcher):
+                answer = prepare_baseline(matcher, scene)
+            else:
+                answer = matcher.prepare(scene.image0, scene.image1).match
+            self._prepared[name] = answer
         return self._prepared[name]
 
     def _on_message(self, _: Pictures, content: dict, buffers: list) -> None:
@@ -221,10 +246,12 @@ class Explorer:
             self.choose("together", bool(content["on"]))
         elif do == "clear":
             self.clear()
+        elif do == "flat":
+            self.lay_flat()
         elif do == "file":
             self._receive(content, buffers)
         else:
-            raise ValueError(f"do must be ask, step, method, together, clear or file, got {do!r}")
+            raise ValueError(f"do must be ask, step, method, together, clear, flat or file, got {do!r}")
 
     def _step(self, to: str) -> None:
         count = len(self.scenes)

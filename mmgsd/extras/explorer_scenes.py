@@ -16,6 +16,7 @@ from mmgsd.dataset import Dataset, load_dataset, sample_pairs
 from mmgsd.images import read_image, to_rgb
 from mmgsd.match.baselines import BASELINES, BaselineMatcher
 from mmgsd.match.matcher import load
+from mmgsd.match.places import Flat
 from mmgsd.model.tensors import WEIGHTS
 from mmgsd.paths import Paths, find_root
 from mmgsd.studies.models import SHIPPED, configure_study, get_label
@@ -36,6 +37,7 @@ class Scene:
     mask1: np.ndarray | None = None  # (H1, W1) bool, which hand-made descriptors need
     xy0: np.ndarray | None = None  # (P, 2) px of the material points
     orbits: list[np.ndarray] | None = None  # true matches (n, 2) px of each
+    flat: bool = False  # the first is the object laid flat: what is asked about are places
 
     def find_truth(self, xy: np.ndarray) -> np.ndarray:
         """True matches (n, 2) px of the material point nearest to a pixel (2,); none where it is far or unknown."""
@@ -50,7 +52,13 @@ class Scene:
         Nothing is known of its matches any more.
         """
         other = {f"image{side}": to_rgb(image, f"image{side}"), f"name{side}": name, "xy0": None, "orbits": None}
-        return dataclasses.replace(self, **other, mask1=self.mask1 if side == 0 else None)
+        kept = {"mask1": self.mask1} if side == 0 else {"mask1": None, "flat": self.flat}
+        return dataclasses.replace(self, **{"flat": False, **other, **kept})
+
+    def lay_flat(self, flat: Flat) -> Scene:
+        """The second image beside the object laid flat; where its matches are known, they stay known."""
+        known = {"xy0": None if self.orbits is None else flat.xy}
+        return dataclasses.replace(self, image0=flat.image, name0=f"{flat.object}, laid flat", flat=True, **known)
 
 
 def make_scenes(data: Dataset, *, pairs: int = 50, seed: int = 0) -> list[Callable[[], Scene]]:

@@ -386,8 +386,11 @@ class Pair:
 
     def _find(self, places: Any, n: Any, joint: bool) -> Match:
         flat, xy, counts = self.matcher.look_up_places(places, joint=joint)
-        asked = dataclasses.replace(self, image0=flat.image, outputs=(flat.outputs, self.outputs[1]), mask0=flat.mask)
-        return asked.match(xy, n=counts if n is None and not joint else n, joint=joint)
+        return self.lay_beside(flat).match(xy, n=counts if n is None and not joint else n, joint=joint)
+
+    def lay_beside(self, flat: Flat) -> Pair:
+        """The same image1 beside the object laid flat (`Matcher.lay_flat`), to be asked about the latter's pixels."""
+        return dataclasses.replace(self, image0=flat.image, outputs=(flat.outputs, self.outputs[1]), mask0=flat.mask)
 
     def _find_mask(self) -> np.ndarray:
         """(H0, W0) bool, where image0 shows the object."""

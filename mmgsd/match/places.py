@@ -51,13 +51,24 @@ class Flat:
         """
         several = isinstance(places, list) or (isinstance(places, np.ndarray) and places.ndim > 1)
         at = np.array([self._find(place) for place in (places if several else [places])]).reshape(-1, 2)
+        if self.object not in OBJECTS:
+            return self._to_pixels(at), None
+        column, row = at.round().astype(int).T
+        number = row * self.outputs.descriptors.shape[2] + column
+        return self._to_pixels(at), load_group(self.object, self.group).count_modes(number)
+
+    @property
+    def xy(self) -> np.ndarray:
+        """Pixels (P, 2) of the material points."""
+        height, width = self.outputs.descriptors.shape[1:]
+        row, column = np.divmod(np.arange(height * width), width)
+        return self._to_pixels(np.stack([column, row], 1))
+
+    def _to_pixels(self, at: np.ndarray) -> np.ndarray:
+        """Pixels (S, 2) of columns and rows."""
         height, width = self.outputs.descriptors.shape[1:]
         cell = np.array([self.image.shape[1] / width, self.image.shape[0] / height])
-        xy = ((at + 0.5) * cell - 0.5).astype(np.float32)
-        if self.object not in OBJECTS:
-            return xy, None
-        column, row = at.round().astype(int).T
-        return xy, load_group(self.object, self.group).count_modes(row * width + column)
+        return ((at + 0.5) * cell - 0.5).astype(np.float32)
 
     def _find(self, place: Any) -> tuple[float, float]:
         """Column and row, with fractions, of a place."""

@@ -220,6 +220,30 @@ def test_points_are_answered_together_where_the_weights_can(explorer: Explorer) 
     assert "answer" not in json.loads(explorer.pictures.answer["json"])[0]["modes"][0]
 
 
+def test_places_are_asked_for_on_the_object_laid_flat(explorer: Explorer) -> None:
+    assert "do not know the object's places" in tell(explorer, "flat")
+    assert explorer.pictures.pair["count"] == 3 and not explorer.scene.flat
+    knowing, right, orbits = explorer.matchers["mmgsd"], explorer.scene.image1, explorer.scene.orbits
+    knowing.places = torch.rand(625, 4, generator=torch.Generator().manual_seed(0))
+    assert tell(explorer, "flat") is None
+    pair = explorer.pictures.pair
+    assert pair["names"][0] == "cloth, laid flat" and pair["number"] == pair["count"] == 4 and pair["truth"]
+    corner = explorer.scene.xy0[0].tolist()
+    assert tell(explorer, "ask", xy=corner, pin=True) is None
+    assert explorer.pictures.answer["points"][0]["matches"] == orbits[0].tolist()
+    expected = knowing.find(right, "corners")
+    np.testing.assert_allclose(explorer.answer.modes, expected.modes, atol=1e-3)
+    assert explorer.pictures.marks == "[]"  # it is no photograph
+    assert tell(explorer, "together", on=True) is None and explorer.answer.joint_weights is not None
+    assert tell(explorer, "together", on=False) is None
+    assert tell(explorer, "method", name="sift").startswith("laid flat must be off for SIFT")
+    image = explorer.scene.image1[:, ::-1]
+    assert tell(explorer, "file", side=1, name="b.png", part=0, parts=1, buffers=(encode(image),)) is None
+    assert explorer.scene.flat and not explorer.pictures.pair["truth"] and tell(explorer, "ask", xy=corner) is None
+    assert tell(explorer, "file", side=0, name="a.png", part=0, parts=1, buffers=(encode(image),)) is None
+    assert not explorer.scene.flat and tell(explorer, "method", name="sift") is None
+
+
 @pytest.mark.parametrize("asked", [False, True])
 def test_where_no_widget_can_be_shown_there_is_a_picture(explorer: Explorer, asked: bool) -> None:
     if asked:
