@@ -284,6 +284,7 @@ def fold(
     chosen: Annotated[str, Option("which like modes are taken: those that one motion agrees with (the default), each "
                                   "pixel's surest, or the surest that belong together",
                                   choices=("agree", "best", "joint"))] = "agree",
+    by_name: Annotated[bool, Option("look for the places that the demonstration names, not for its pixels")] = False,
     intrinsics: Annotated[Any, Option("px, or the nine numbers of the matrix; prints rays too", type=parse_intrinsics,
                                       metavar="FX,FY,CX,CY")] = None,
     out: Annotated[Picture, Option("draw the moves (png, jpg, pdf or svg)")] | None = None,
@@ -296,7 +297,7 @@ def fold(
 
     shown, now = read_demonstration(demonstration), mmgsd.read_image(image)
     _check_written([image], out=out)
-    answer = answer_picture(mmgsd.load(weights), shown, now, look=look, chosen=chosen)
+    answer = answer_picture(mmgsd.load(weights), shown, now, look=look, chosen=chosen, by_name=by_name)
     if out:
         from mmgsd.figures.folding import plot_moves
 

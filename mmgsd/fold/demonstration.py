@@ -1,11 +1,12 @@
 """A demonstration: an image, and from which pixels to which the grippers went; a look each, as JSON beside its images.
 
     {"object": "cloth",
-     "looks": [{"image": "edge_0.webp", "moves": [[[x, y], [x, y]], …], "anchors": [[x, y], …]}, …]}
+     "looks": [{"image": "edge_0.webp", "moves": [[[x, y], [x, y]], …], "anchors": [[x, y], …], "places": […]}, …]}
 
 ``moves``: pick and place, px of the look's image, all made at once. A pick must be on the object; a place may be
 anywhere, and is carried to another picture by the motion that takes the object there. ``anchors``: further pixels on
-the object that tell that motion, such as its corners, at least two of the first look.
+the object that tell that motion, such as its corners, at least two of the first look. ``places``, where they are
+known: which of the object's each pick and then each anchor is, as `Matcher.find` takes places.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from mmgsd.checks import check
 from mmgsd.files import DamagedFileError, read_json, write_bytes, write_json
 from mmgsd.images import check_pixels, encode_image, find_beside, read_image
 
-LOOK = {"image", "moves", "anchors"}
+LOOK = {"image", "moves", "anchors", "places"}
 LEAST = 2  # pixels that tell a motion
 
 
@@ -31,6 +32,7 @@ class Look:
     image: np.ndarray  # (H, W, 3) uint8
     moves: np.ndarray  # (M, 2, 2) px: pick and place
     anchors: np.ndarray  # (A, 2) px
+    places: tuple[Any, ...] = ()  # M + A, which of the object's the picks and the anchors are; or none
 
     @property
     def asked(self) -> np.ndarray:
@@ -67,7 +69,7 @@ def read_demonstration(path: Path | str) -> Demonstration:
 def _read_look(path: Path, number: int, look: Any) -> Look:
     where = f"{path}, look {number}"
     if not isinstance(look, dict) or not {"image", "moves"} <= set(look) <= LOOK or not isinstance(look["image"], str):
-        accepted = "'image', a file's name, 'moves' and maybe 'anchors'"
+        accepted = "'image', a file's name, 'moves' and maybe 'anchors' and 'places'"
         raise DamagedFileError(f"{where} must hold {accepted}, got {look!r:.80}")
     image = read_image(find_beside(path, look["image"]))
     moves, anchors = (_read_pixels(where, key, look.get(key, []), shape) for key, shape in
@@ -78,7 +80,11 @@ def _read_look(path: Path, number: int, look: Any) -> Look:
         check_pixels(np.concatenate([moves.reshape(-1, 2), anchors]), image.shape[1::-1], image=look["image"])
     except ValueError as error:
         raise DamagedFileError(f"{where}: {error}") from error
-    return Look(image, moves, anchors)
+    places, count = look.get("places", []), len(moves) + len(anchors)
+    if not isinstance(places, list) or len(places) not in (0, count):
+        accepted = f"a list of {count}, of each pick and anchor"
+        raise DamagedFileError(f"{where}: places must be {accepted}, got {places!r:.80}")
+    return Look(image, moves, anchors, tuple(tuple(p) if isinstance(p, list) else p for p in places))
 
 
 def _read_pixels(where: str, key: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
@@ -104,5 +110,5 @@ def write_demonstration(demonstration: Demonstration, path: Path, *, quality: in
         image = path.with_name(f"{path.stem}_{number}.webp")
         write_bytes(image, encode_image(look.image, quality=quality))
         pixels = {name: getattr(look, name).round(2).tolist() for name in ("moves", "anchors")}
-        looks.append({"image": image.name, **pixels})
+        looks.append({"image": image.name, **pixels, **({"places": list(look.places)} if look.places else {})})
     return write_json(path, {"object": demonstration.object, "looks": looks}, indent=None)

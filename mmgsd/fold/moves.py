@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from mmgsd.checks import check_choice
+from mmgsd.checks import check_choice, read_flag
 from mmgsd.fold.consensus import (
     RADIUS,
     Motion,
@@ -75,15 +76,28 @@ def choose_moves(
     return PolicyAnswer(np.stack([np.where(near[:, None], grasped, wanted), motion.apply(places)], 1), motion, share)
 
 
+def match_look(matcher: Matcher, look: Look, image: np.ndarray, *, by_name: bool = False, **how: Any) -> Match:
+    """The matches of a look's picks and anchors, found by their pixels in its image or by its places' names.
+
+    ``how`` is as `Matcher.match` has it. ValueError where the look, or the weights, know no places.
+    """
+    if not by_name:
+        return matcher.match(look.image, image, look.asked, **how)
+    if not look.places:
+        raise ValueError("by_name must be False: the demonstration's look names no places")
+    return matcher.find(image, list(look.places), **how)
+
+
 def answer_picture(
-    matcher: Matcher, demonstration: Demonstration, image: np.ndarray, *, look: int = 0, chosen: str = AGREE
-) -> PolicyAnswer:
+    matcher: Matcher, demonstration: Demonstration, image: np.ndarray, *, look: int = 0, chosen: str = AGREE,
+    by_name: bool = False,
+) -> PolicyAnswer:  # fmt: skip
     """Moves (M, 2, 2) px in a picture (H, W, 3) uint8 of the present state, as one look of a demonstration made them.
 
     The picture is taken from about where the demonstration's was: a turn, a shift and a scale lead from one to the
-    other; ``chosen`` is as `choose_moves` has it. ValueError for a look that there is not, weights of another object, a
-    picture that does not show the object, a pick off the object, and where fewer than `LEAST` of the look's picks and
-    anchors agree.
+    other; ``chosen`` is as `choose_moves` has it. ``by_name`` the look's places are looked for instead of its pixels.
+    ValueError for a look that there is not, or that names no places, weights of another object, a picture that does not
+    show the object, a pick off the object, and where fewer than `LEAST` of the look's picks and anchors agree.
     """
     count = len(demonstration.looks)
     if look not in range(count):
@@ -93,7 +107,7 @@ def answer_picture(
                          f"{matcher.object!r}")  # fmt: skip
     check_choice("chosen", chosen, (AGREE, BEST, JOINT))
     shown = demonstration.looks[look]
-    match = matcher.match(shown.image, image, shown.asked, joint=chosen == JOINT)
+    match = match_look(matcher, shown, image, by_name=read_flag("by_name", by_name), joint=chosen == JOINT)
     if match.on_object is not None and (match.on_object < 0.5).any():
         off = shown.asked[match.on_object < 0.5].tolist()
         raise ValueError(f"picks and anchors must be on the object of the demonstration, these are not: {off}")

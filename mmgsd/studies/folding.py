@@ -158,7 +158,8 @@ class Bench:
         for moves, state in zip(task.looks, self.demonstrated[task.name], strict=False):
             pixels = np.array(true_moves(moves, self.demonstrated[task.name][0].points, state), float)
             anchors = [k for k in ANCHORS[task.object] if state.visible[k] and k not in [move.pick for move in moves]]
-            looks.append(Look(state.image, pixels.reshape(-1, 2, 2), state.xy[anchors].astype(float)))
+            places = (*(move.pick for move in moves), *anchors)
+            looks.append(Look(state.image, pixels.reshape(-1, 2, 2), state.xy[anchors].astype(float), places))
         return Demonstration(task.object, tuple(looks))
 
     def roll(

@@ -12,7 +12,7 @@ import numpy as np
 
 from mmgsd.config import DEFAULT_GROUP, load_preset
 from mmgsd.fold.demonstration import Look
-from mmgsd.fold.moves import AGREE, BEST, JOINT
+from mmgsd.fold.moves import AGREE, BEST, JOINT, match_look
 from mmgsd.match.baselines import BaselineMatcher
 from mmgsd.match.match import Match
 from mmgsd.match.matcher import Matcher, find_weights
@@ -37,6 +37,7 @@ class Policy:
     # instead of shipped weights: the row of the main table that the preset `TRAINED_BY` trained
     trained: str = field(default="", repr=False)  # the weights themselves are what an answer depends on
     one: bool = field(default=False, repr=False)  # answers with one mode, as what learnt one match a pixel does
+    named: bool = field(default=False, repr=False)  # looks for places by name, whatever the demonstration's picture
     looks: int = 1  # where few of its modes agree, it looks so often, each time from elsewhere, before it acts
 
 
@@ -47,6 +48,7 @@ POLICIES = {
         Policy("mmgsd", "MMGSD, modes that agree", "#D55E00", "", AGREE),
         Policy("mmgsd_paper", "MMGSD of clean images alone, modes that agree", "#B22222", "-paper", AGREE),
         Policy("mmgsd_again", "the same, looks again if unsure", "#8A3500", "", AGREE, looks=3),
+        Policy("mmgsd_named", "MMGSD, places by name, modes that agree", "#E69F00", "", AGREE, named=True),
         Policy("mmgsd_joint", "MMGSD, surest joint answer", "#F0A070", "", JOINT),
         Policy("mmgsd_best", "MMGSD, each pixel's surest", "#A6761D", "", BEST),
         Policy("spcl", "SPCL, modes that agree", "#0072B2", "-spcl", AGREE),
@@ -98,7 +100,7 @@ def ask(policy: Policy, object: str, look: Look, image: np.ndarray, mask: np.nda
     """
     matcher, order = load_matcher(policy, object), load_group(object, DEFAULT_GROUP[object]).order
     told = {"mask1": mask} if isinstance(matcher, BaselineMatcher) else {"joint": policy.chosen == JOINT}
-    return matcher.match(look.image, image, look.asked, n=1 if policy.one else order, **told)
+    return match_look(matcher, look, image, by_name=policy.named, n=1 if policy.one else order, **told)
 
 
 def draw_moves(look: Look, mask: np.ndarray, rng: np.random.Generator) -> np.ndarray:

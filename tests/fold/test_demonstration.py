@@ -15,7 +15,8 @@ from mmgsd.fold.demonstration import Demonstration, Look, read_demonstration, wr
 @pytest.fixture
 def written(tmp_path: Path, rng: np.random.Generator) -> Path:
     image = rng.integers(0, 256, (40, 60, 3), dtype=np.uint8)
-    first = Look(image, np.array([[[5.0, 6], [50, 30]], [[8, 9], [10.5, 11]]]), np.array([[20.0, 20], [30, 10]]))
+    first = Look(image, np.array([[[5.0, 6], [50, 30]], [[8, 9], [10.5, 11]]]), np.array([[20.0, 20], [30, 10]]),
+                 (26, "corners", (0.5, 0.25), 0))  # fmt: skip
     second = Look(image[::-1], np.array([[[1.0, 2], [3, 4]]]), np.zeros((0, 2)))
     return write_demonstration(Demonstration("cloth", (first, second)), tmp_path / "edge.json")
 
@@ -25,6 +26,7 @@ def test_a_demonstration_is_read_as_it_was_written(written: Path) -> None:
     assert read.object == "cloth" and [len(look.moves) for look in read.looks] == [2, 1]
     assert read.looks[0].moves[1].tolist() == [[8, 9], [10.5, 11]]
     assert read.looks[0].asked.tolist() == [[5, 6], [8, 9], [20, 20], [30, 10]]
+    assert read.looks[0].places == (26, "corners", (0.5, 0.25), 0) and read.looks[1].places == ()
     assert read.looks[1].anchors.shape == (0, 2) and read.looks[1].image.shape == (40, 60, 3)
 
 
@@ -35,6 +37,7 @@ CASES = {
     "no moves": (lambda v: v["looks"][1].update(moves=[]), "look 1: moves must be at least one"),
     "flat moves": (lambda v: v["looks"][0].update(moves=[[1, 2], [3, 4]]), "look 0: moves must be a list of"),
     "words": (lambda v: v["looks"][0].update(anchors=["left"]), "look 0: anchors must be a list of"),
+    "too few places": (lambda v: v["looks"][0].update(places=[3]), "look 0: places must be a list of 4"),
     "outside": (lambda v: v["looks"][0].update(anchors=[[100, 5], [1, 1]]), "look 0: .*edge_0.webp"),
     "one place": (lambda v: v["looks"].__setitem__(0, v["looks"][1]), "look 0: at least 2 picks and anchors"),
 }

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 import mmgsd
 from mmgsd.__main__ import main
@@ -60,6 +62,23 @@ def test_the_surest_modes_of_a_picture_are_those_of_each_pixel(data, demonstrati
     np.testing.assert_allclose(answer.moves[:, 0], surest)
     with pytest.raises(ValueError, match="chosen must .*got 'first'"):
         answer_picture(matcher, demonstration, image, chosen="first")
+
+
+def test_places_by_name_need_no_look_at_the_demonstrations_picture(data, demonstration, written, capsys) -> None:
+    matcher, image, look = mmgsd.load("cloth"), data.load_image(NOW), demonstration.looks[0]
+    blank = dataclasses.replace(look, image=np.zeros_like(look.image), places=(*CORNERS, *INSIDE))
+    with pytest.raises(ValueError, match="by_name must be False"):
+        answer_picture(matcher, demonstration, image, by_name=True)
+    with pytest.raises(ValueError, match="do not know the object's places"):
+        answer_picture(matcher, Demonstration("cloth", (blank,)), image, by_name=True)
+    described = matcher.describe([data.load_image(DEMO)])
+    points = torch.from_numpy(data.xy[DEMO])
+    matcher.places = matcher.sample_sources(described[0], points, data.size)[0]
+    answer = answer_picture(matcher, Demonstration("cloth", (blank,)), image, by_name=True)
+    assert answer.share == 1 and find_error(data, answer.moves[:, 0]) < 15
+    with pytest.raises(SystemExit) as stopped:
+        main(["fold", str(written), str(SAMPLE / data.labels.file[NOW]), "--weights", "cloth", "--by-name"])
+    assert stopped.value.code == 2 and "by_name must be False" in capsys.readouterr().err
 
 
 def test_the_command_prints_pixels_and_rays(data, written, capsys) -> None:

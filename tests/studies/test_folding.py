@@ -138,6 +138,8 @@ def test_demonstrations_are_written_as_a_users_are_read(tmp_path: Path, physics:
         read, task = read_demonstration(path), TASKS[path.stem]
         assert read.object == task.object and [len(look.moves) for look in read.looks] == list(map(len, task.looks))
         assert len(read.looks[0].asked) > len(task.looks[0])
+        for look, moves in zip(read.looks, task.looks, strict=True):
+            assert len(look.places) == len(look.asked) and look.places[: len(moves)] == tuple(m.pick for m in moves)
 
 
 def test_rows_of_other_policies_stay(tmp_path: Path, physics: list[str]) -> None:
