@@ -263,6 +263,10 @@ for _number in range(1, ROUNDS + 1):
     _round = {**ROUND, "seed": _number, "views": {"cloth": 5 if _number < 4 else 2, "rope": 10 if _number < 3 else 1}}
     PRESETS[_clean] = _preset(_clean, **_round, cluttered=_cluttered)
     PRESETS[_cluttered] = _preset(_cluttered, **_round, scene="workspace")
+# images that no round has seen, by which what is shipped is chosen and calibrated: its test images alone
+_unseen = {**_round, "test_images": 150, "seed": ROUNDS + 1}
+PRESETS["unseen"] = _preset("unseen", **_unseen, cluttered="unseen_workspace")
+PRESETS["unseen_workspace"] = _preset("unseen_workspace", **_unseen, scene="workspace")
 
 
 def digest(config: Config) -> str:

@@ -2,15 +2,23 @@
 
     python -m mmgsd rounds cloth           every round that is missing, one after another
     python -m mmgsd rounds cloth --last 2  up to the second
+    python -m mmgsd rounds cloth --photographs FOLDER    instead: what the last one finds in photographs with marks
+    python -m mmgsd rounds cloth --ship                  instead: calibrate the last ones' average and ship it
 
 A round renders its clean and its cluttered images, with seeds of its own, trains on them and leaves its weights as
 ``data/weights/cloth-round2.safetensors``, from which the next one goes on: of the rounds before nothing else is needed.
 Its errors on simulations held out from it are kept in data/results/rounds.json. These are few: beside them stand the
 errors on all of its images, of the weights ``before``, which never saw them, and of those ``after``, trained on them.
+
+What is shipped as ``cloth`` is the average of the last rounds' weights (Wortsman et al., "Model soups", ICML 2022), of
+as many of those that are there as err least on images of the preset ``unseen``, which no round has seen and no table is
+made of; by them it is read and calibrated, too. Photographs choose nothing.
 """
 
 from __future__ import annotations
 
+import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,20 +26,23 @@ import pandas as pd
 
 from mmgsd.command import Option
 from mmgsd.config import OBJECTS, ROUNDS, TrainConfig, load_preset
-from mmgsd.dataset import load_parts
+from mmgsd.dataset import load_dataset, load_parts
 from mmgsd.extras.shipping import ship_model
 from mmgsd.files import write_json
 from mmgsd.learn.checkpoints import LOG
 from mmgsd.learn.training import train_model
 from mmgsd.match.matcher import load
+from mmgsd.measure.calibration import calibrate_unseen
 from mmgsd.measure.evaluation import read_results
+from mmgsd.measure.photographs import measure_answers, read_photographs
 from mmgsd.measure.questions import measure_rmse
-from mmgsd.model.tensors import describe_run
+from mmgsd.model.tensors import describe_run, read_tensors, write_tensors
 from mmgsd.paths import Paths, find_root
 from mmgsd.scene.stage import render_dataset
 from mmgsd.studies.models import configure_study
 
 VALIDATIONS = 8  # of a round
+UNSEEN = ("unseen", "unseen_workspace")  # presets
 PAIRS, POINTS = 200, 60  # of all of a round's images, and material points asked about
 RESULTS = "rounds.json"  # in data/results
 
@@ -84,15 +95,72 @@ def _keep_curve(root: Path, object: str, number: int, weights: Path, errors: dic
     write_json(file, {name: dict(sorted(rows[name].items())) for name in OBJECTS if name in rows})
 
 
+def measure_round(root: Path, object: str, folder: Path) -> dict[str, Any]:
+    """What the last round finds in photographs (`measure_answers`), read as the shipped weights are; kept with it."""
+    file, number = root / "data" / "results" / RESULTS, find_round(root, object)
+    matcher = load(_find_file(root, object, number))
+    matcher.readout = load(object).readout
+    found = measure_answers(matcher, read_photographs(folder, object))
+    rows: dict[str, Any] = read_results(file, depth=2)
+    rows[object][str(number)]["photographs"] = found
+    write_json(file, rows)
+    return found
+
+
+def ship_rounds(root: Path, object: str, *, workers: int = 0) -> Path:
+    """Average, calibrate and ship the rounds whose weights are there as those of the object; returns the file."""
+    unseen = [render_dataset(load_preset(name).render[object], Paths(root, name).dataset(object), only_test=True,
+                             workers=workers) for name in UNSEEN]  # fmt: skip
+    parts = [load_dataset(folder, "test") for folder in unseen]
+    place = root / "data" / "generated" / "rounds" / object
+    there = [file for k in range(ROUNDS, 0, -1) if (file := _find_file(root, object, k)).is_file()]
+    errors = {}
+    for count in range(1, len(there) + 1):
+        averaged = average_weights(there[:count], place / f"{count}.safetensors")
+        matcher = load(averaged)
+        errors[averaged] = sum(measure_rmse(matcher, part, pairs=PAIRS, points=POINTS) for part in parts)
+    chosen = min(errors, key=errors.get)
+    calibrate_unseen(chosen, unseen)
+    return ship_model(chosen, root / "data" / "weights" / f"{object}.safetensors", _describe_rounds(root, object))
+
+
+def _describe_rounds(root: Path, object: str) -> dict[str, Any]:
+    """What the card says of all rounds together."""
+    number = find_round(root, object)
+    rows = read_results(root / "data" / "results" / RESULTS, depth=2).get(object, {})
+    runs = [row["run"] for name, row in rows.items() if int(name) <= number]
+    total = {name: sum(run[name] for run in runs) for name in ("images", "steps", "minutes")}
+    presets, seeds = f"presets `round1` to `round{number}` and their cluttered ones", f"1 to {number}"
+    return {**total, "preset": f"round{number}", "presets": presets, "seed": seeds, "data_seed": seeds, "measured": {}}
+
+
+def average_weights(files: Sequence[Path], out: Path) -> Path:
+    """Write the mean of several files' tensors, with the first one's metadata and what was ``averaged``, to ``out``."""
+    read = [read_tensors(file) for file in files]
+    mean = {name: (sum(tensors[name].float() for tensors, _ in read) / len(read)).to(value.dtype)
+            for name, value in read[0][0].items()}  # fmt: skip
+    return write_tensors(out, mean, {**read[0][1], "averaged": json.dumps([file.stem for file in files])})
+
+
 def main(
     object: Annotated[str, Option(choices=OBJECTS)],
     *,
     last: Annotated[int, Option("go on up to this round", choices=range(1, ROUNDS + 1))] = ROUNDS,
     render_only: Annotated[bool, Option("render the next round's images and stop")] = False,
+    photographs: Annotated[Path, Option("instead measure the last round on these")] | None = None,
+    ship: Annotated[bool, Option("instead calibrate the last rounds' average and ship it")] = False,
     workers: Annotated[int, Option("processes that render (default: one a core)")] = 0,
 ) -> None:
-    """Run the rounds of an object that are missing."""
+    """Run the rounds of an object that are missing; or measure, or ship, those that are there."""
     root = find_root()
+    if ship or photographs:
+        if not find_round(root, object):
+            raise ValueError(f"object must have a round trained first, {object!r} has none in data/weights")
+        if photographs:
+            print(json.dumps(measure_round(root, object, photographs)))
+        if ship:
+            print(ship_rounds(root, object, workers=workers))
+        return
     for number in range(find_round(root, object) + 1, last + 1):
         if render_only:
             print(render_round(root, object, number, workers=workers))

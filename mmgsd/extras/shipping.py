@@ -31,7 +31,7 @@ Descriptors of the method `{method}` for a {object}, symmetry group `{group}`; `
 
 | | |
 |---|---|
-| data | preset {presets}, {images} training images of {width} x {height} px, seed {data_seed}, fingerprint `{data}` |
+| data | {presets}, {images} training images of {width} x {height} px, seed {data_seed}, fingerprint `{data}` |
 | training | {steps} steps of {batch} images at {input_px} px, seed {seed}, {minutes:.0f} minutes on {hardware} |
 {errors}
 | file | {megabytes:.1f} MB, safetensors, weights in half precision |
@@ -41,6 +41,7 @@ Descriptors of the method `{method}` for a {object}, symmetry group `{group}`; `
 ERRORS = (
     "| RMSE, {where} | {rmse_mean:.1f} px mean, {median:.1f} px median, {queries:,} queries with a visible source |"
 )
+AVERAGED = "| weights | the average of {names} |"
 NOT_MEASURED = "| RMSE | not measured yet |"
 PHOTOGRAPHS = "| photographs | of {photographs}, {found:.0f} % of the marked places found within 5 % of the size |"
 LIMITS = """\
@@ -57,7 +58,8 @@ def ship_model(weights: Path, out: Path, facts: dict) -> Path:
 
     A file that says the same already is left alone: the order of a safetensors header's entries is not kept.
     ``facts``: ``preset``, ``data_seed``, and ``measured``, {which test images: ``rmse_mean``, ``median``, ``queries``}
-    and under "photographs" `mmgsd.measure.photographs.measure_photographs`.
+    and under "photographs" `mmgsd.measure.photographs.measure_photographs`; what else the card says of several
+    trainings after one another: ``presets``, ``images``, ``steps``, ``seed`` and ``minutes``.
     DamagedFileError for damaged weights, ForeignFileError where ``out`` or the card's place is another kind of file.
     """
     tensors, note = read_tensors(weights)
@@ -67,13 +69,15 @@ def ship_model(weights: Path, out: Path, facts: dict) -> Path:
     if not out.is_file() or not _holds(out, state, note):
         write_tensors(out, state, note)
     width, height = json.loads(note["size"])
-    presets = " and ".join(f"`{name}`" for name in (facts["preset"], config.also) if name)
+    presets = "preset " + " and ".join(f"`{name}`" for name in (facts["preset"], config.also) if name)
     described = {
-        **dataclasses.asdict(config), **note, **facts, "name": out.stem, "width": width, "height": height,
+        **dataclasses.asdict(config), **note, "name": out.stem, "width": width, "height": height,
         "title": f"{out.stem}.safetensors", "minutes": float(note["seconds"]) / 60, "presets": presets,
         "megabytes": out.stat().st_size / 1e6, "errors": _describe_errors(facts["measured"]),
-        "limits": CLUTTER_LIMITS if config.clutter else LIMITS,
+        "limits": CLUTTER_LIMITS if config.clutter else LIMITS, **facts,
     }  # fmt: skip
+    if averaged := json.loads(note.get("averaged", "[]")):
+        described["errors"] = AVERAGED.format(names=", ".join(f"`{n}`" for n in averaged)) + "\n" + described["errors"]
     write_text(out.with_suffix(".md"), CARD.format(**described))
     return out
 

@@ -42,6 +42,7 @@ TEMPERATURES = (0.1, 10.0)  # range in which the calibrated one is sought
 PICTURES = 400  # at most, that an object's places are described by
 POWERS, SHARPNESSES = (1.0, 1.25, 1.5, 2.0), (1.0, 2.0, 3.0, 4.0, 6.0, 8.0)  # of readings that are tried
 ALLOWED = 1.05  # times the RMSE of modes that are read as they are
+WIDENED = (1.0, 1.2, 1.5, 2.0)  # times the likeliest temperature
 PAIRS, LEAST_PAIRS = 400, 40  # drawn, and the fewest: half of these can just tell the level of 95 %
 
 
@@ -79,7 +80,8 @@ def calibrate_unseen(
     """The same by the test images of data sets that were not trained on, from which a reading is chosen first.
 
     ``unseen`` are their folders, one or more, of other seeds than those that the weights are measured on. The reading
-    (`choose_readout`) is kept as ``power`` and ``sharpness``, the fingerprints as ``unseen``.
+    (`choose_temperature`, `choose_readout`) is kept as ``temperature``, ``power`` and ``sharpness``, the fingerprints
+    as ``unseen``.
     Errors are those of `calibrate_weights`, and ValueError where a data set is that of the training.
     """
     overwrite, weights = read_flag("overwrite", overwrite), Path(weights)
@@ -91,9 +93,10 @@ def calibrate_unseen(
         if part.fingerprint == note.get("data"):
             raise ValueError(f"unseen must be data sets that {weights} was not trained on, got that: {part.folder}")
     data = join_datasets(*parts)
+    choose_temperature(matcher, data)
     readout = choose_readout(matcher, data, progress=read_flag("progress", progress))
-    chosen = {"power": repr(readout.exponent), "sharpness": repr(readout.mean_exponent),
-              "unseen": json.dumps([part.fingerprint for part in parts])}  # fmt: skip
+    chosen = {"temperature": repr(matcher.temperature), "power": repr(readout.exponent),
+              "sharpness": repr(readout.mean_exponent), "unseen": json.dumps([part.fingerprint for part in parts])}
     how = {"pairs": pairs, "points": points, "progress": progress}
     return _calibrate(weights, matcher, data, chosen, "unseen must hold test", **how)
 
@@ -110,6 +113,22 @@ def _calibrate(
     places = describe_places(matcher, data).cpu()
     tensors, note = read_tensors(weights)
     return write_tensors(weights, tensors | {PLACES: places}, {**note, **chosen, "calibration": found.to_json()})
+
+
+def choose_temperature(matcher: Matcher, data: Dataset, *, pairs: int = 60, points: int = 40) -> float:
+    """The temperature with the least mean error on ``data``: the likeliest (`calibrate_temperature`) or a higher one.
+
+    Modes are fitted better to heatmaps that are wider than likelihood wants them, and probabilities are calibrated
+    anyway. ``data`` must not have been trained on. Leaves it set on the matcher and returns it.
+    """
+    likely, errors = calibrate_temperature(matcher, data), {}
+    config = EvaluateConfig(pairs=pairs, points=points)
+    answer = model_answer(matcher, data, config)
+    for temperature in (likely * factor for factor in WIDENED):
+        matcher.temperature = temperature
+        errors[temperature] = measure_mean_error(answer, matcher, data, config)
+    matcher.temperature = min(errors, key=errors.get)
+    return matcher.temperature
 
 
 @own_numerics()

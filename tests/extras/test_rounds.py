@@ -8,11 +8,14 @@ import shutil
 from pathlib import Path
 
 import pytest
+import torch
 
-from mmgsd.config import ROUNDS, load_preset
+from mmgsd.config import ROUNDS, RenderConfig, load_preset
 from mmgsd.extras import rounds
 from mmgsd.match import matcher
-from mmgsd.match.matcher import load
+from mmgsd.match.matcher import find_shipped, load
+from mmgsd.measure import calibration
+from mmgsd.model.tensors import read_tensors
 from mmgsd.studies.models import configure_study
 
 TINY = {"steps": 8, "batch": 2, "pairs": 2, "queries": 8, "input_px": 128, "also": ""}
@@ -25,8 +28,12 @@ def root(cloth_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     def configure(*arguments: object) -> dict:
         return {name: dataclasses.replace(each, **TINY) for name, each in configure_study(*arguments).items()}
 
-    def render(config: object, folder: Path, **_: object) -> Path:
-        return folder if folder.is_dir() else Path(shutil.copytree(cloth_dataset, folder))
+    def render(config: RenderConfig, folder: Path, **_: object) -> Path:
+        if not folder.is_dir():
+            shutil.copytree(cloth_dataset, folder)
+            info = json.loads((folder / "dataset.json").read_text()) | {"config": {"seed": config.seed}}
+            (folder / "dataset.json").write_text(json.dumps(info))
+        return folder
 
     monkeypatch.setattr(rounds, "configure_study", configure)
     monkeypatch.setattr(rounds, "render_dataset", render)
@@ -65,3 +72,43 @@ def test_each_round_has_images_of_its_own(number: int) -> None:
     assert (model.also, model.seed) == (cluttered.name, number)
     assert clean.render["rope"].views == cluttered.render["rope"].views == (10 if number < 3 else 1)
     assert model.trunk_weights == (f"rope-round{number - 1}" if number > 1 else "")
+
+
+def test_the_average_of_the_last_rounds_is_shipped_where_it_errs_least(root: Path, monkeypatch, capsys) -> None:
+    monkeypatch.setattr(rounds, "find_root", lambda: root)
+    with pytest.raises(ValueError, match="'cloth' has none"):
+        rounds.main("cloth", ship=True)
+    files = [rounds.run_round(root, "cloth", number) for number in (1, 2)]
+    errors = {"1": 9.0, "2": 7.0}
+    monkeypatch.setattr(rounds, "measure_rmse", lambda matcher, *_, **__: errors[current[-1]])
+    current, average = [], rounds.average_weights
+
+    def follow(chosen: list[Path], out: Path) -> Path:
+        current.append(out.stem)
+        return average(chosen, out)
+
+    monkeypatch.setattr(rounds, "average_weights", follow)
+    monkeypatch.setattr(calibration, "LEAST_PAIRS", 4)
+    monkeypatch.setattr(calibration, "choose_readout", lambda matcher, *_, **__: matcher.readout)
+    rounds.main("cloth", ship=True)
+    shipped = root / "data" / "weights" / "cloth.safetensors"
+    assert capsys.readouterr().out.split()[-1] == str(shipped)
+    (tensors, note), (first, _), (second, _) = map(read_tensors, (shipped, *files))
+    assert json.loads(note["averaged"]) == ["cloth-round2", "cloth-round1"] and "unseen" in note
+    one, other, mean = (each["head.source.weight"].float() for each in (first, second, tensors))
+    torch.testing.assert_close(mean, (one + other) / 2, atol=1e-4, rtol=0)
+    card = shipped.with_suffix(".md").read_text()
+    assert "presets `round1` to `round2` and their cluttered ones" in card and "| 16 steps of" in card
+    assert "the average of `cloth-round2`, `cloth-round1`" in card
+
+
+def test_photographs_are_measured_of_the_last_round(root: Path, monkeypatch, capsys) -> None:
+    monkeypatch.setattr(rounds, "find_root", lambda: root)
+    rounds.run_round(root, "cloth", 1)
+    shipped = load(find_shipped() / "cloth.safetensors")
+    monkeypatch.setattr(rounds, "load", lambda name: shipped if name == "cloth" else load(name))
+    monkeypatch.setattr(rounds, "read_photographs", lambda folder, kind: [folder, kind])
+    monkeypatch.setattr(rounds, "measure_answers", lambda matcher, asked: {"sharp": matcher.readout.mean_exponent})
+    rounds.main("cloth", photographs=Path("mine"))
+    stored = json.loads((root / "data" / "results" / "rounds.json").read_text())["cloth"]["1"]
+    assert stored["photographs"] == {"sharp": 6.0} == json.loads(capsys.readouterr().out.splitlines()[-1])

@@ -138,11 +138,16 @@ def test_unseen_images_choose_how_modes_are_read_as_well(
         return matcher.readout
 
     monkeypatch.setattr(calibration, "choose_readout", choose)
+    errors = {1.0: 9.0, 1.2: 7.0, 1.5: 5.0, 2.0: 6.0}  # px, of the likeliest temperature times these
+    likely = calibrate_temperature(Matcher.load(weights, device="cpu"), load_dataset(cloth_dataset, "test"))
+    monkeypatch.setattr(calibration, "measure_mean_error",
+                        lambda _, matcher, *__: errors[round(matcher.temperature / likely, 3)])  # fmt: skip
     monkeypatch.setattr(calibration, "LEAST_PAIRS", 8)  # of four images
     how = {"pairs": 12, "points": 4, "progress": False}
     calibrate_unseen(weights, [cloth_dataset], **how)
     matcher, said = Matcher.load(weights, device="cpu"), load_metadata(weights)
     assert matcher.readout == ModeReadout(0.2, 1.5, 4.0) and matcher.calibration.pairs >= 8
+    assert matcher.temperature == pytest.approx(1.5 * likely)
     assert json.loads(said["unseen"]) == [load_dataset(cloth_dataset, "test").fingerprint]
     stamp = weights.stat().st_mtime_ns
     calibrate_unseen(weights, [cloth_dataset], **how)
