@@ -150,9 +150,9 @@ class Explorer:
 
     def _mark(self) -> None:
         """Take what is pinned for the marked places of the left image; they stay when another is opened."""
+        if self.scene.flat:  # no photograph
+            return
         file, kind = self.scene.name0, getattr(self.matchers[self.pictures.method], "object", "")
-        if self.scene.flat:
-            return  # no photograph
         self.marks.pop(file, None)
         if self.pins:
             self.marks[file] = describe_marks(file, self.pins, kind)

@@ -102,7 +102,7 @@ def measure_round(root: Path, object: str, folder: Path) -> dict[str, Any]:
     matcher.readout = load(object).readout
     found = measure_answers(matcher, read_photographs(folder, object))
     rows: dict[str, Any] = read_results(file, depth=2)
-    rows[object][str(number)]["photographs"] = found
+    rows.setdefault(object, {}).setdefault(str(number), {})["photographs"] = found
     write_json(file, rows)
     return found
 
