@@ -8,7 +8,9 @@
 A round renders its clean and its cluttered images, with seeds of its own, trains on them and leaves its weights as
 ``data/weights/cloth-round2.safetensors``, from which the next one goes on: of the rounds before nothing else is needed.
 Its errors on simulations held out from it are kept in data/results/rounds.json. These are few: beside them stand the
-errors on all of its images, of the weights ``before``, which never saw them, and of those ``after``, trained on them.
+errors on all of its images, of the weights ``before``, which never saw them, and of those ``after``, trained on them;
+and, once the weights are shipped, on the same ``unseen`` images for all: each round ``alone``, and the ``averaged``
+weights of it and those after it.
 
 What is shipped as ``cloth`` is the average of the last rounds' weights (Wortsman et al., "Model soups", ICML 2022), of
 as many of those that are there as err least on images of the preset ``unseen``, which no round has seen and no table is
@@ -26,7 +28,7 @@ import pandas as pd
 
 from mmgsd.command import Option
 from mmgsd.config import OBJECTS, ROUNDS, TrainConfig, load_preset
-from mmgsd.dataset import load_dataset, load_parts
+from mmgsd.dataset import Dataset, load_dataset, load_parts
 from mmgsd.extras.shipping import ship_model
 from mmgsd.files import write_json
 from mmgsd.learn.checkpoints import LOG
@@ -80,30 +82,38 @@ def _find_file(root: Path, object: str, number: int) -> Path:
 
 def measure_images(weights: Path, data: Path, model: TrainConfig) -> dict[str, float]:
     """The error (px) of weights on all training images of a round, clean and cluttered ones."""
-    matcher, parts = load(weights), load_parts(data, "train", also=model.also)
+    return _measure_parts(weights, load_parts(data, "train", also=model.also))
+
+
+def _measure_parts(weights: Path, parts: Sequence[Dataset]) -> dict[str, float]:
+    matcher = load(weights)
     errors = [round(measure_rmse(matcher, part, pairs=PAIRS, points=POINTS), 2) for part in parts]
     return dict(zip(("clean", "cluttered"), errors, strict=False))
 
 
 def _keep_curve(root: Path, object: str, number: int, weights: Path, errors: dict[str, dict[str, float]]) -> None:
     """Add a round's curve, its cost, and the ``errors`` before and after it to the results."""
-    file = root / "data" / "results" / RESULTS
-    rows: dict[str, Any] = read_results(file, depth=2)
     log = pd.read_csv(weights.with_name(LOG)).dropna(subset="rmse_px")
     curve = {str(step): rmse for step, rmse in zip(log.step, log.rmse_px, strict=True)}
-    rows.setdefault(object, {})[str(number)] = {"rmse_px": curve, "run": describe_run(weights), **errors}
+    _keep(root, object, number, rmse_px=curve, run=describe_run(weights), **errors)
+
+
+def _keep(root: Path, object: str, number: int, **found: Any) -> None:
+    """Add what was found to the row of a round."""
+    file = root / "data" / "results" / RESULTS
+    rows: dict[str, Any] = read_results(file, depth=2)
+    row = rows.setdefault(object, {}).get(str(number), {})
+    rows[object][str(number)] = row | found
     write_json(file, {name: dict(sorted(rows[name].items())) for name in OBJECTS if name in rows})
 
 
 def measure_round(root: Path, object: str, folder: Path) -> dict[str, Any]:
     """What the last round finds in photographs (`measure_answers`), read as the shipped weights are; kept with it."""
-    file, number = root / "data" / "results" / RESULTS, find_round(root, object)
+    number = find_round(root, object)
     matcher = load(_find_file(root, object, number))
     matcher.readout = load(object).readout
     found = measure_answers(matcher, read_photographs(folder, object))
-    rows: dict[str, Any] = read_results(file, depth=2)
-    rows.setdefault(object, {}).setdefault(str(number), {})["photographs"] = found
-    write_json(file, rows)
+    _keep(root, object, number, photographs=found)
     return found
 
 
@@ -113,13 +123,16 @@ def ship_rounds(root: Path, object: str, *, workers: int = 0) -> Path:
                              workers=workers) for name in UNSEEN]  # fmt: skip
     parts = [load_dataset(folder, "test") for folder in unseen]
     place = root / "data" / "generated" / "rounds" / object
-    there = [file for k in range(ROUNDS, 0, -1) if (file := _find_file(root, object, k)).is_file()]
-    errors = {}
-    for count in range(1, len(there) + 1):
-        averaged = average_weights(there[:count], place / f"{count}.safetensors")
-        matcher = load(averaged)
-        errors[averaged] = sum(measure_rmse(matcher, part, pairs=PAIRS, points=POINTS) for part in parts)
-    chosen = min(errors, key=errors.get)
+    errors, used = {}, []
+    for number in range(find_round(root, object), 0, -1):
+        file = _find_file(root, object, number)
+        if file.is_file():
+            used.append(file)
+            averaged = average_weights(used, place / f"{len(used)}.safetensors")
+            errors[averaged] = _measure_parts(averaged, parts)
+            alone = _measure_parts(file, parts) if len(used) > 1 else errors[averaged]
+            _keep(root, object, number, unseen={"alone": alone, "averaged": errors[averaged]})
+    chosen = min(errors, key=lambda file: sum(errors[file].values()))
     calibrate_unseen(chosen, unseen)
     return ship_model(chosen, root / "data" / "weights" / f"{object}.safetensors", _describe_rounds(root, object))
 

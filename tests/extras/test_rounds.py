@@ -79,20 +79,19 @@ def test_the_average_of_the_last_rounds_is_shipped_where_it_errs_least(root: Pat
     with pytest.raises(ValueError, match="'cloth' has none"):
         rounds.main("cloth", ship=True)
     files = [rounds.run_round(root, "cloth", number) for number in (1, 2)]
-    errors = {"1": 9.0, "2": 7.0}
-    monkeypatch.setattr(rounds, "measure_rmse", lambda matcher, *_, **__: errors[current[-1]])
-    current, average = [], rounds.average_weights
-
-    def follow(chosen: list[Path], out: Path) -> Path:
-        current.append(out.stem)
-        return average(chosen, out)
-
-    monkeypatch.setattr(rounds, "average_weights", follow)
+    errors = {"1": 9.0, "2": 7.0, "cloth-round1": 11.0}
+    monkeypatch.setattr(rounds, "_measure_parts", lambda file, _: {"clean": errors[file.stem], "cluttered": 1.0})
     monkeypatch.setattr(calibration, "LEAST_PAIRS", 4)
     monkeypatch.setattr(calibration, "choose_readout", lambda matcher, *_, **__: matcher.readout)
     rounds.main("cloth", ship=True)
     shipped = root / "data" / "weights" / "cloth.safetensors"
     assert capsys.readouterr().out.split()[-1] == str(shipped)
+    stored = json.loads((root / "data" / "results" / "rounds.json").read_text())["cloth"]
+    assert stored["1"]["unseen"] == {
+        "alone": {"clean": 11.0, "cluttered": 1.0},
+        "averaged": {"clean": 7.0, "cluttered": 1.0},
+    }
+    assert stored["2"]["unseen"]["alone"] == stored["2"]["unseen"]["averaged"] and "rmse_px" in stored["2"]
     (tensors, note), (first, _), (second, _) = map(read_tensors, (shipped, *files))
     assert json.loads(note["averaged"]) == ["cloth-round2", "cloth-round1"] and "unseen" in note
     one, other, mean = (each["head.source.weight"].float() for each in (first, second, tensors))
