@@ -2,7 +2,7 @@
 
     python -m mmgsd rounds cloth           every round that is missing, one after another
     python -m mmgsd rounds cloth --last 2  up to the second
-    python -m mmgsd rounds cloth --photographs FOLDER    instead: what the last one finds in photographs with marks
+    python -m mmgsd rounds cloth --photographs FOLDER    instead: what the last one, or --last, finds in photographs
     python -m mmgsd rounds cloth --ship                  instead: calibrate the last ones' average and ship it
 
 A round renders its clean and its cluttered images, with seeds of its own, trains on them and leaves its weights as
@@ -107,9 +107,8 @@ def _keep(root: Path, object: str, number: int, **found: Any) -> None:
     write_json(file, {name: dict(sorted(rows[name].items())) for name in OBJECTS if name in rows})
 
 
-def measure_round(root: Path, object: str, folder: Path) -> dict[str, Any]:
-    """What the last round finds in photographs (`measure_answers`), read as the shipped weights are; kept with it."""
-    number = find_round(root, object)
+def measure_round(root: Path, object: str, number: int, folder: Path) -> dict[str, Any]:
+    """What a round finds in photographs (`measure_answers`), read as the shipped weights are; kept with it."""
     matcher = load(_find_file(root, object, number))
     matcher.readout = load(object).readout
     found = measure_answers(matcher, read_photographs(folder, object))
@@ -158,9 +157,9 @@ def average_weights(files: Sequence[Path], out: Path) -> Path:
 def main(
     object: Annotated[str, Option(choices=OBJECTS)],
     *,
-    last: Annotated[int, Option("go on up to this round", choices=range(1, ROUNDS + 1))] = ROUNDS,
+    last: Annotated[int, Option("go on up to this round, or measure it", choices=range(1, ROUNDS + 1))] = ROUNDS,
     render_only: Annotated[bool, Option("render the next round's images and stop")] = False,
-    photographs: Annotated[Path, Option("instead measure the last round on these")] | None = None,
+    photographs: Annotated[Path, Option("instead measure the last round on these, with marks")] | None = None,
     ship: Annotated[bool, Option("instead calibrate the last rounds' average and ship it")] = False,
     workers: Annotated[int, Option("processes that render (default: one a core)")] = 0,
 ) -> None:
@@ -170,7 +169,7 @@ def main(
         if not find_round(root, object):
             raise ValueError(f"object must have a round trained first, {object!r} has none in data/weights")
         if photographs:
-            print(json.dumps(measure_round(root, object, photographs)))
+            print(json.dumps(measure_round(root, object, min(last, find_round(root, object)), photographs)))
         if ship:
             print(ship_rounds(root, object, workers=workers))
         return

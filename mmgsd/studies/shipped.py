@@ -44,6 +44,8 @@ Rows = Mapping[str, Mapping[str, Any]]  # data/results/shipped.json, {name: what
 SETS = {"paper": "clean", "workspace": "cluttered"}  # test images: what readers know them as
 SIDES = {"cloth": "side", "rope": "length"}  # of what an error is a share
 READING = ("power", "sharpness")
+ROUND_HEADS = ("steps so far", "clean: RMSE px", "cluttered", "averaged with all later rounds: clean", "cluttered",
+               "photographs: found", "spurious", "by name: found", "spurious")  # fmt: skip
 
 
 def list_names(rows: Rows, object: str) -> list[str]:
@@ -172,6 +174,24 @@ def describe_knowledge(rows: Rows) -> Table:
     return make_page_table(list(measures), lines)
 
 
+def describe_rounds(rounds: Rows) -> Table:
+    """The training of the shipped weights, a row a round: errors on images that none has seen, and in photographs."""
+    lines = {}
+    for object, rows in rounds.items():
+        steps = 0
+        for number, row in sorted(rows.items(), key=lambda item: int(item[0])):
+            steps += row["run"]["steps"]
+            unseen, photographs = row.get("unseen", {}), row.get("photographs", {})
+            lines[f"{object}, {number}"] = [
+                f"{steps}",
+                *(say_value(unseen.get(which), word, 1, ".1f") for which in ("alone", "averaged")
+                  for word in SETS.values()),
+                *(say_value(found, key, 100, ".0f", " %") for found in (photographs, photographs.get("by_name"))
+                  for key in ("found@5%", "spurious")),
+            ]  # fmt: skip
+    return make_page_table(ROUND_HEADS, lines)
+
+
 def make_sources_sentence(rows: Rows) -> str:
     """What is counted in photographs, and which public repositories they are from."""
     sources = dict.fromkeys(name for object in OBJECTS for name in rows[object]["photographs"]["sources"])
@@ -277,6 +297,7 @@ STUDY = Study(
         "readings": Shown(RESULTS, describe_readings),
         "knowledge": Shown(RESULTS, describe_knowledge),
         "sources": Shown(RESULTS, make_sources_sentence),
+        "rounds": Shown("rounds.json", describe_rounds),
         "by_source": Shown(RESULTS, describe_sources),
         "counts": Shown(RESULTS, make_counts_sentence),
         "alike": Shown(RESULTS, make_reading_sentence),

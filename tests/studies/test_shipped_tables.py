@@ -9,6 +9,7 @@ from mmgsd.studies.shipped import (
     describe_limits,
     describe_pictures,
     describe_readings,
+    describe_rounds,
     describe_sources,
     list_names,
     make_counts_sentence,
@@ -117,6 +118,15 @@ def test_each_repository_is_a_row_and_what_it_lacks_a_dash() -> None:
         "| cloth, `a/b` | 12 | 20 % | 45 % | 83 % | 30 % | 12.0 % |",
         "| rope, `c/d` | – | – | – | – | – | – |",
     ]
+
+
+def test_each_round_is_a_row_and_its_steps_are_those_so_far() -> None:
+    unseen = {"alone": {"clean": 20.15, "cluttered": 47.38}, "averaged": {"clean": 19.73, "cluttered": 47.01}}
+    found = {"found@5%": 0.776, "spurious": 0.195, "by_name": {"found@5%": 0.827, "spurious": 0.17}}
+    rows = {"2": {"run": {"steps": 4000}, "unseen": unseen, "photographs": found}, "1": {"run": {"steps": 3000}}}
+    lines = to_markdown(describe_rounds({"cloth": rows})).splitlines()
+    assert lines[2] == "| cloth, 1 | 3000 |" + " – |" * 8
+    assert lines[3] == "| cloth, 2 | 7000 | 20.1 | 47.4 | 19.7 | 47.0 | 78 % | 20 % | 83 % | 17 % |"
 
 
 def test_limits_are_in_px_shares_of_the_side_and_milliseconds() -> None:
