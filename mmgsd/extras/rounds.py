@@ -4,6 +4,7 @@
     python -m mmgsd rounds cloth --last 2  up to the second
     python -m mmgsd rounds cloth --photographs FOLDER    instead: what the last one, or --last, finds in photographs
     python -m mmgsd rounds cloth --ship                  instead: calibrate the last ones' average and ship it
+    python -m mmgsd rounds cloth --card                  instead: write its card with what `run shipped cloth` found
 
 A round renders its clean and its cluttered images, with seeds of its own, trains on them and leaves its weights as
 ``data/weights/cloth-round2.safetensors``, from which the next one goes on: of the rounds before nothing else is needed.
@@ -19,6 +20,7 @@ made of; by them it is read and calibrated, too. Photographs choose nothing.
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -38,10 +40,12 @@ from mmgsd.measure.calibration import calibrate_unseen
 from mmgsd.measure.evaluation import read_results
 from mmgsd.measure.photographs import measure_answers, read_photographs
 from mmgsd.measure.questions import measure_rmse
+from mmgsd.measure.shipped import SETS
 from mmgsd.model.tensors import describe_run, read_tensors, write_tensors
 from mmgsd.paths import Paths, find_root
 from mmgsd.scene.stage import render_dataset
 from mmgsd.studies.models import configure_study
+from mmgsd.studies.shipped import RESULTS as SHIPPED_RESULTS
 
 VALIDATIONS = 8  # of a round
 UNSEEN = ("unseen", "unseen_workspace")  # presets
@@ -133,14 +137,28 @@ def ship_rounds(root: Path, object: str, *, workers: int = 0) -> Path:
             _keep(root, object, number, unseen={"alone": alone, "averaged": errors[averaged]})
     chosen = min(errors, key=lambda file: sum(errors[file].values()))
     calibrate_unseen(chosen, unseen)
-    return ship_model(chosen, root / "data" / "weights" / f"{object}.safetensors", _describe_rounds(root, object))
+    return ship_model(chosen, _find_shipped(root, object), _describe_rounds(root, object))
+
+
+def write_card(root: Path, object: str) -> Path:
+    """Write the card of the shipped weights anew, with what was measured of these; the weights' path."""
+    weights, results = _find_shipped(root, object), root / "data" / "results" / SHIPPED_RESULTS
+    row = read_results(results).get(object, {})
+    if row.get("sha256") != hashlib.sha256(weights.read_bytes()).hexdigest():
+        raise ValueError(f"object must be measured first, {results} has nothing of {weights}: "
+                         f"python -m mmgsd run shipped {object}")  # fmt: skip
+    measured = {name: row[name] for name in (*SETS, "photographs") if name in row}
+    return ship_model(weights, weights, _describe_rounds(root, object) | {"measured": measured})
+
+
+def _find_shipped(root: Path, object: str) -> Path:
+    return root / "data" / "weights" / f"{object}.safetensors"
 
 
 def _describe_rounds(root: Path, object: str) -> dict[str, Any]:
     """What the card says of all rounds together."""
-    number = find_round(root, object)
     rows = read_results(root / "data" / "results" / RESULTS, depth=2).get(object, {})
-    runs = [row["run"] for name, row in rows.items() if int(name) <= number]
+    number, runs = max(map(int, rows)), [row["run"] for row in rows.values()]
     total = {name: sum(run[name] for run in runs) for name in ("images", "steps", "minutes")}
     presets, seeds = f"presets `round1` to `round{number}` and their cluttered ones", f"1 to {number}"
     return {**total, "preset": f"round{number}", "presets": presets, "seed": seeds, "data_seed": seeds, "measured": {}}
@@ -161,10 +179,14 @@ def main(
     render_only: Annotated[bool, Option("render the next round's images and stop")] = False,
     photographs: Annotated[Path, Option("instead measure the last round on these, with marks")] | None = None,
     ship: Annotated[bool, Option("instead calibrate the last rounds' average and ship it")] = False,
+    card: Annotated[bool, Option("instead write its card with what it was measured to do")] = False,
     workers: Annotated[int, Option("processes that render (default: one a core)")] = 0,
 ) -> None:
     """Run the rounds of an object that are missing; or measure, or ship, those that are there."""
     root = find_root()
+    if card:
+        print(write_card(root, object))
+        return
     if ship or photographs:
         if not find_round(root, object):
             raise ValueError(f"object must have a round trained first, {object!r} has none in data/weights")

@@ -18,12 +18,11 @@ from mmgsd.config import OBJECTS, TrainConfig, load_preset
 from mmgsd.files import DamagedFileError, ForeignFileError, is_kept, locked, quarantine, write_bytes, write_text
 from mmgsd.measure.calibration import calibrate_weights
 from mmgsd.measure.evaluation import read_results
-from mmgsd.measure.shipped import SETS
 from mmgsd.model.tensors import WEIGHTS, load_metadata, read_config, read_tensors, write_tensors
 from mmgsd.paths import Paths, find_root
 from mmgsd.studies.models import SHIPPED, configure_model
 from mmgsd.studies.parameters import check_made
-from mmgsd.studies.shipped import RESULTS
+from mmgsd.studies.sample import PAPER_SIZE
 
 CARD = """# {title}
 
@@ -141,7 +140,7 @@ def main(
 ) -> None:
     """Ship the models of a preset, those that are trained and evaluated; or take the shipped ones for trained."""
     config, paths = load_preset(preset), Paths(find_root(), preset)
-    models = {(name, method): configure_model(config, name, method) for name in OBJECTS for method in SHIPPED}
+    models = {(name, method): configure_model(config, name, method) for name in OBJECTS for method in PAPER_SIZE}
     shipped = {key: paths.root / "data" / "weights" / f"{key[0]}{SHIPPED[key[1]]}.safetensors" for key in models}
     if restore:
         for key, file in shipped.items():
@@ -151,7 +150,7 @@ def main(
     check_made(paths, "04_evaluate with run=True", [paths.results / "rmse.json"])
     for (name, method), model in models.items():
         weights, measured = paths.model(model) / WEIGHTS, _find_measured(paths, name, method)
-        if not weights.is_file() or not (measured or method == "shipped"):  # these are measured as they are shipped
+        if not (weights.is_file() and measured):
             print(f"{name} {method}: not trained and evaluated yet")
             continue
         if paths.dataset(name).is_dir():  # elsewhere trained weights are shipped as they came
@@ -162,8 +161,5 @@ def main(
 
 def _find_measured(paths: Paths, object: str, method: str) -> dict[str, dict]:
     """What the results hold of a shipped model, {} where nothing is measured."""
-    if method == "shipped":
-        row = read_results(paths.root / "data" / "results" / RESULTS).get(object, {})
-        return {name: row[name] for name in (*SETS, "photographs") if name in row}
     row = read_results(paths.results / "rmse.json", depth=2).get(object, {}).get(method)
     return {paths.preset: row} if row else {}

@@ -51,7 +51,6 @@ def by_object(**values: float) -> Rule:
 
 ITS_OWN = Rule("the weights of what it starts from", lambda start, _: start.name)
 LAST_ROUND = Rule("the weights of the round before", lambda start, _: f"{start.object}-round{start.seed}")
-PAPER_ONLY = Rule("the shipped weights of the paper's images", lambda start, _: f"{start.object}-paper")
 
 
 @dataclass(frozen=True)
@@ -92,11 +91,6 @@ MODELS = (
     Model("mmgsd_muon", "MMGSD, Muon, detail branch", "mmgsd_long",
           {"network": "lite0x2fine", "optimiser": "muon", "input_px": times(2), "roundness": 0.05}, ("main",),
           "MMGSD, Muon", "#FF3D00"),
-    Model("shipped", "MMGSD, shipped: clutter too", "mmgsd_muon",
-          {"trunk_weights": PAPER_ONLY, "heads": True, "clutter": True, "also": "workspace",
-           "steps": by_object(cloth=3000, rope=2000),
-           "learning_rate": times(2 / 3), "sigma_start_px": 8.0, "prototype_weight": 0.0}, ("main", "shipped"),
-          "MMGSD, shipped", "#A6761D"),
     Model("mmgsd_plain", "MMGSD, own loss alone", "mmgsd", {"prototype_weight": 0.0}, FOUR, "MMGSD, plain", "#F0A070"),
     Model("spcl_deep", "SPCL, dense, deeper network", "spcl_dense", {"network": "lite0x2"},
           short="SPCL, deeper", colour="#4477CC"),
@@ -131,7 +125,7 @@ MODELS = (
     Model("round1", "MMGSD, round 1", "light", {"seed": 1, "steps": by_object(cloth=4000, rope=3000)}, ("rounds",)),
     *(Model(f"round{n}", f"MMGSD, round {n}", f"round{n - 1}",
             {"seed": n, "trunk_weights": LAST_ROUND, "learning_rate": 1e-3, "sigma_start_px": 8.0,
-             "strong": by_object(cloth=n > 2, rope=True)}, ("rounds",))
+             "strong": by_object(cloth=n > 2, rope=True)}, ("rounds",), "MMGSD, shipped" * (n == ROUNDS), "#A6761D")
       for n in range(2, ROUNDS + 1)),
     # what each part of the shipped models' training brings, one after another
     Model("mmgsd_workspace", "MMGSD, workspace renders too", "mmgsd", {"also": "workspace"}, ("robustness",),
@@ -149,11 +143,12 @@ UNTRAINED = (
     Model("centre", "object's centre", "", studies=("chance",), short="Object centre", colour="#404040"),
 )
 ROWS = {row.name: row for row in (*MODELS, *UNTRAINED)}
-SHIPPED = {"shipped": "", "mmgsd": "-paper", "spcl": "-spcl"}  # row: what its files' names in data/weights end with
+# row: what the names of its files in data/weights end with
+SHIPPED = {f"round{ROUNDS}": "", "mmgsd": "-paper", "spcl": "-spcl"}
 SMALL = ("symmetry", "budget", "sigma", "fixes", "robustness", "backbones")  # studies of the equal, smaller budget
 RUN = ("first", "symmetry", "budget", "sigma", "main")  # studies that are run unless one is named, in this order
 # on a preset's own images and one seed: not "fixes" and "seeds"
-STUDIES = (*RUN, "robustness", "backbones", "shipped")
+STUDIES = (*RUN, "robustness", "backbones")
 
 
 def list_rows(study: str) -> list[Model]:

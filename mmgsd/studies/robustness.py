@@ -11,7 +11,7 @@ from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mmgsd.config import OBJECTS, load_preset
+from mmgsd.config import OBJECTS, ROUNDS, load_preset
 from mmgsd.figures.style import PAGE_IN, finish_axes, styled
 from mmgsd.match.baselines import BASELINES, OPTIONAL
 from mmgsd.studies.matrix import run_matrix
@@ -25,7 +25,7 @@ PANELS = (  # a title, what is measured there, and times what
     ("Cluttered renders", "workspace", "rmse_mean", 1.0, "RMSE (px)"),
     ("Photographs", "photographs", "found@5%", 100.0, "Corners, ends found (%)"),
 )
-COLOURS = {"": get_colour("shipped"), "paper": get_colour("mmgsd")}
+COLOURS = {"": get_colour(f"round{ROUNDS}"), "paper": get_colour("mmgsd")}
 COLOURS |= {name: get_colour(name) for name in (*BASELINES, *OPTIONAL)}
 LABELS = {"": "MMGSD, shipped", "paper": "MMGSD, clean images only"}
 

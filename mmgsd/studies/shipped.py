@@ -35,7 +35,7 @@ from mmgsd.model.tensors import WEIGHTS
 from mmgsd.paths import Paths, find_root
 from mmgsd.studies.models import PAPER, SHIPPED, configure_study, get_label
 from mmgsd.studies.registry import Shown, Study
-from mmgsd.studies.table import ERRORS, Table, make_page_table, say_value
+from mmgsd.studies.table import ERRORS, MISSING, Table, make_page_table, say_value
 
 STUDIES = ("robustness", "backbones")
 RESULTS = "shipped.json"
@@ -108,11 +108,17 @@ def describe_pictures(rows: Rows, labels: Mapping[str, str] | None = None) -> Ta
     for name, label in labels.items():
         photographs = get_photographs(rows, name)
         cells = [say_value(rows[name].get(preset), "rmse_mean", 1, ".1f") for preset in SETS]
-        cells += [_say_interval(photographs, key) for key in ("found@5%", "spurious")]
-        cells.append(say_value(photographs, "unanswered", 100, ".0f", " %"))
-        cells.append(say_value(photographs, "best", 1, ".1f", " %"))
-        lines[f"{name.partition('@')[0].partition('-')[0]}, {label}"] = cells[: len(heads)]
+        cells += _tell_photographs(photographs)
+        title = f"{name.partition('@')[0].partition('-')[0]}, {label}"
+        lines[title] = cells[: len(heads)]
+        if by_name := photographs.get("by_name"):
+            lines[f"{title}, by name"] = [MISSING] * len(SETS) + _tell_photographs(by_name)
     return make_page_table(heads, lines)
+
+
+def _tell_photographs(found: Mapping[str, Any]) -> list[str]:
+    shares = [_say_interval(found, key) for key in ("found@5%", "spurious")]
+    return [*shares, say_value(found, "unanswered", 100, ".0f", " %"), say_value(found, "best", 1, ".1f", " %")]
 
 
 def _say_interval(photographs: Mapping[str, Any], key: str) -> str:

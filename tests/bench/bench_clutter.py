@@ -1,6 +1,7 @@
 """What pasting costs a step of training: ``python tests/bench/bench_clutter.py``, written to data/results/clutter.json.
 
-The shipped models' training, on the images of `make smoke`, with and without `TrainConfig.clutter` in turn.
+The first round of the shipped models' training, on the images of `make smoke`, with and without `TrainConfig.clutter`
+in turn.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from mmgsd.config import OBJECTS, load_preset
 from mmgsd.files import write_json
 from mmgsd.model.network import name_hardware
 from mmgsd.paths import Paths, find_root
-from mmgsd.studies.models import configure_model
+from mmgsd.studies.models import configure_study
 from mmgsd.studies.parameters import check_images
 
 ROUNDS = 2
@@ -27,7 +28,7 @@ def main() -> None:
     results, root = {}, find_root()
     check_images(Paths(root, "smoke"), OBJECTS, split="train")
     for name in OBJECTS:
-        config = dataclasses.replace(configure_model(load_preset("paper"), name, "shipped"), also="")
+        config = dataclasses.replace(configure_study(load_preset("round1"), name, "rounds")["round1"], also="")
         seconds = {True: [], False: []}
         for clutter in (True, False) * ROUNDS:
             changed = dataclasses.replace(config, clutter=clutter)

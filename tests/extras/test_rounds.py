@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import shutil
 from pathlib import Path
@@ -98,7 +99,18 @@ def test_the_average_of_the_last_rounds_is_shipped_where_it_errs_least(root: Pat
     torch.testing.assert_close(mean, (one + other) / 2, atol=1e-4, rtol=0)
     card = shipped.with_suffix(".md").read_text()
     assert "presets `round1` to `round2` and their cluttered ones" in card and "| 16 steps of" in card
-    assert "the average of `cloth-round2`, `cloth-round1`" in card
+    assert "the average of `cloth-round2`, `cloth-round1`" in card and "not measured yet" in card
+
+    with pytest.raises(ValueError, match=r"run shipped cloth"):
+        rounds.main("cloth", card=True)
+    found = {"rmse_mean": 20.06, "median": 9.0, "queries": 1234}
+    row = {"sha256": hashlib.sha256(shipped.read_bytes()).hexdigest(), "paper": found}
+    (root / "data" / "results" / "shipped.json").write_text(json.dumps({"cloth": row}))
+    rounds.main("cloth", card=True)
+    again = shipped.with_suffix(".md").read_text()
+    assert hashlib.sha256(shipped.read_bytes()).hexdigest() == row["sha256"]
+    assert "| RMSE, paper | 20.1 px mean" in again and "not measured" not in again
+    assert again.splitlines()[:8] == card.splitlines()[:8]
 
 
 def test_photographs_are_measured_of_the_last_round(root: Path, monkeypatch, capsys) -> None:

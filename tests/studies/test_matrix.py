@@ -188,7 +188,8 @@ def test_what_a_model_starts_from_is_trained_before_it(tiny_dataset: Callable[..
 
 
 @pytest.mark.parametrize(("study", "names"), [
-    ("robustness", ["mmgsd", "mmgsd_workspace", "mmgsd_clutter", "mmgsd_heads"]), ("shipped", ["shipped"]),
+    ("robustness", ["mmgsd", "mmgsd_workspace", "mmgsd_clutter", "mmgsd_heads"]),
+    ("backbones", ["light", "dinov2s"]),
 ])  # fmt: skip
 def test_a_study_can_be_run_alone(study: str, names: list[str], chosen: list[TrainConfig]) -> None:
     paper = load_preset("paper")

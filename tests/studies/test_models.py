@@ -141,16 +141,6 @@ def test_values_may_follow_from_what_a_row_starts_from() -> None:
     assert ROWS["mmgsd_long"].difference == "steps × 3" and ROWS["±45° only"].difference.endswith("rotation_deg 45.0")
 
 
-def test_the_shipped_models_see_both_kinds_of_scenes_and_start_from_the_shipped_weights() -> None:
-    for object in OBJECTS:
-        muon, shipped = (configure_model(PAPER, object, name) for name in ("mmgsd_muon", "shipped"))
-        more = {"heads": True, "clutter": True, "also": "workspace", "trunk_weights": f"{object}-paper"}
-        going_on = {
-            name: getattr(shipped, name) for name in ("steps", "learning_rate", "sigma_start_px", "prototype_weight")
-        }
-        assert shipped == dataclasses.replace(muon, **more, **going_on) and shipped.steps < muon.steps
-
-
 def test_what_robustness_brings_is_added_one_by_one_at_the_equal_budget() -> None:
     models = configure_study(PAPER, "cloth", "robustness")
     assert [(m.also, m.clutter, m.heads) for m in models.values()] == [
@@ -167,9 +157,6 @@ def test_a_fix_has_images_of_its_own() -> None:
 
 def test_models_that_need_other_images_are_run_where_they_are_asked_for() -> None:
     assert not any(model.also for model in [*list_runs(PAPER), *list_runs(PAPER, ["main"])])
-    assert [model.name for model in list_runs(PAPER, ["shipped"])] == [
-        configure_model(PAPER, object, "shipped").name for object in OBJECTS
-    ]
     assert len(list_runs(PAPER, ["robustness"])) == 8 and STUDIES[: len(RUN)] == RUN
 
 

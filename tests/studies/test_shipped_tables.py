@@ -44,6 +44,9 @@ def test_what_was_not_measured_is_a_dash() -> None:
     assert lines[2] == "| cloth, `cloth` | 21.0 | 21.0 | 51 % (40 to 62) | 25 % | 31 % | 8.0 % |"
     assert lines[3] == "| cloth, `cloth-paper` | 26.1 | 88.0 | – | – | – | – |"
     assert lines[4] == "| cloth, ORB | 71.2 | – | – | – | – | – |"
+    named = ROWS | {"cloth": ROWS["cloth"] | {"photographs": FOUND | {"by_name": FOUND | {"found@5%": 0.62}}}}
+    added = to_markdown(describe_pictures(named)).splitlines()[3]
+    assert added == "| cloth, `cloth`, by name | – | – | 62 % (40 to 62) | 25 % | 31 % | 8.0 % |"
     assert len({line.count("|") for line in lines}) == 1
 
 
