@@ -78,13 +78,16 @@ def get_photographs(rows: Rows, name: str) -> Mapping[str, Any]:
 
 def describe_limits(rows: Rows) -> Table:
     """What an answer of the shipped weights is worth, and costs, in a user's units."""
-    seen = (say_value(rows[object].get("photographs"), "found@5%", 100, ".0f", " %") for object in SIDES)
+    photographs = [rows[object].get("photographs") or {} for object in SIDES]
+    seen = [[say_value(row, "found@5%", 100, ".0f", " %") for row in (each.get("by_name"), each)]
+            for each in photographs]  # fmt: skip
     slowest = rows[max(SIDES, key=lambda object: rows[object]["milliseconds"])]
     lines = {
         "it knows": "square cloths, and ropes whose ends look alike; anything else has to be learnt first",
         **{f"mean error, {word} renders": "; ".join(_tell_error(rows[object], preset) for object in SIDES)
            for preset, word in SETS.items()},
-        "in photographs": "found within 5 % of the size: {} of a cloth's corners, {} of a rope's ends".format(*seen),
+        "in photographs": "found within 5 % of the size: {} of a cloth's corners by name, {} by another picture; "
+                          "of a rope's ends {} and {}".format(*seen[0], *seen[1]),
         "it takes": f"{slowest['milliseconds']:.0f} ms for two new images and a question ({slowest['hardware']}); "
                     "a GPU is not needed",
         "on a robot": "never tried",

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 import mmgsd
 from mmgsd.__main__ import main
@@ -70,10 +69,7 @@ def test_places_by_name_need_no_look_at_the_demonstrations_picture(data, demonst
     with pytest.raises(ValueError, match="by_name must be False"):
         answer_picture(matcher, demonstration, image, by_name=True)
     with pytest.raises(ValueError, match="do not know the object's places"):
-        answer_picture(matcher, Demonstration("cloth", (blank,)), image, by_name=True)
-    described = matcher.describe([data.load_image(DEMO)])
-    points = torch.from_numpy(data.xy[DEMO])
-    matcher.places = matcher.sample_sources(described[0], points, data.size)[0]
+        answer_picture(mmgsd.load("cloth-paper"), Demonstration("cloth", (blank,)), image, by_name=True)
     answer = answer_picture(matcher, Demonstration("cloth", (blank,)), image, by_name=True)
     assert answer.share == 1 and find_error(data, answer.moves[:, 0]) < 15
     with pytest.raises(SystemExit) as stopped:
