@@ -40,7 +40,7 @@ Descriptors of the method `{method}` for a {object}, symmetry group `{group}`; `
 ERRORS = (
     "| RMSE, {where} | {rmse_mean:.1f} px mean, {median:.1f} px median, {queries:,} queries with a visible source |"
 )
-AVERAGED = "| weights | the average of {names} |"
+AVERAGED = "| weights | {which} {names} |"
 NOT_MEASURED = "| RMSE | not measured yet |"
 PHOTOGRAPHS = "| photographs | of {photographs}, {found:.0f} % of the marked places found within 5 % of the size |"
 LIMITS = """\
@@ -76,7 +76,8 @@ def ship_model(weights: Path, out: Path, facts: dict) -> Path:
         "limits": CLUTTER_LIMITS if config.clutter else LIMITS, **facts,
     }  # fmt: skip
     if averaged := json.loads(note.get("averaged", "[]")):
-        described["errors"] = AVERAGED.format(names=", ".join(f"`{n}`" for n in averaged)) + "\n" + described["errors"]
+        which, names = "the average of" if len(averaged) > 1 else "those of", ", ".join(f"`{n}`" for n in averaged)
+        described["errors"] = AVERAGED.format(which=which, names=names) + "\n" + described["errors"]
     write_text(out.with_suffix(".md"), CARD.format(**described))
     return out
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 from matplotlib.figure import Figure
@@ -17,24 +18,24 @@ from mmgsd.studies.parameters import check_images
 from mmgsd.studies.registry import Experiment, Study
 
 
-def list_shown(paths: Paths, **_: int) -> list[Path]:
+def list_shown(paths: Paths, **_: Any) -> list[Path]:
     """The figure of how a preset's images differ."""
     return [paths.root / "figures" / "data" / f"{paths.preset}_variety.png"]
 
 
-def check(paths: Paths, *, images: int = 48) -> None:
-    """ValueError where training images are not rendered."""
-    check_images(paths, OBJECTS, split="train")
+def check(paths: Paths, *, images: int = 48, split: str = "train") -> None:
+    """ValueError where the images of the ``split`` are not rendered."""
+    check_images(paths, OBJECTS, split=split)
 
 
-def run(paths: Paths, *, images: int = 48) -> Path:
-    """Count a preset's training images, and draw so many ``images`` on a contact sheet; the figure."""
-    data, (file,) = {name: load_dataset(paths.dataset(name), "train") for name in OBJECTS}, list_shown(paths)
+def run(paths: Paths, *, images: int = 48, split: str = "train") -> Path:
+    """Count a preset's images of a ``split``, and draw so many ``images`` on a contact sheet; the figure."""
+    data, (file,) = {name: load_dataset(paths.dataset(name), split) for name in OBJECTS}, list_shown(paths)
     modes = {name: {g: [d.group(g).count_modes(p) for p in range(N_POINTS)] for g in d.info["symmetry"]}
              for name, d in data.items()}  # fmt: skip
     for name, d in data.items():
         save_figure(plot_sheet(d, images), file.with_name(f"{paths.preset}_{name}"), kinds=("jpg",))
-    return save_figure(plot_variety({n: measure_folder(d.folder) for n, d in data.items()}, modes), file)[-1]
+    return save_figure(plot_variety({n: measure_folder(d.folder, split) for n, d in data.items()}, modes), file)[-1]
 
 
 def find_folders(study: Experiment) -> dict[str, Path]:
@@ -44,9 +45,9 @@ def find_folders(study: Experiment) -> dict[str, Path]:
 
 
 @cache
-def measure_folder(folder: Path) -> pd.DataFrame:
-    """`mmgsd.dataset.measure_images` of a data set's training images, once."""
-    return measure_images(load_dataset(folder, "train"))
+def measure_folder(folder: Path, split: str = "train") -> pd.DataFrame:
+    """`mmgsd.dataset.measure_images` of a data set's images of a ``split``, once."""
+    return measure_images(load_dataset(folder, split))
 
 
 def plot_sheet(data: Dataset, count: int) -> Figure:
