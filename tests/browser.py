@@ -40,10 +40,13 @@ def run_lab(folder: Path) -> Iterator[str]:
     options = ["--no-browser", "--allow-root", "--ServerApp.ip=127.0.0.1", f"--ServerApp.port={port}",
                f"--ServerApp.root_dir={folder}", "--IdentityProvider.token="]  # fmt: skip
     places = {f"JUPYTER_{kind}_DIR": str(folder / kind) for kind in ("CONFIG", "RUNTIME", "DATA")}
-    # show every cell, also those out of sight
-    settings = folder / "CONFIG" / "lab" / "user-settings" / "@jupyterlab" / "notebook-extension"
-    settings.mkdir(parents=True)
-    (settings / "tracker.jupyterlab-settings").write_text('{"windowingMode": "none"}')
+    # show every cell, also those out of sight, and no question about news
+    settings = folder / "CONFIG" / "lab" / "user-settings" / "@jupyterlab"
+    for name, text in {"notebook-extension/tracker": '{"windowingMode": "none"}',
+                       "apputils-extension/notification": '{"fetchNews": "false"}'}.items():  # fmt: skip
+        file = settings / f"{name}.jupyterlab-settings"
+        file.parent.mkdir(parents=True)
+        file.write_text(text)
     env = {**os.environ, **places, "MMGSD_ROOT": str(ROOT), "PYTHONPATH": str(ROOT)}
     with (folder / "lab.log").open("w") as log:
         server = subprocess.Popen([sys.executable, "-m", "jupyterlab", *options], env=env, stdout=log, stderr=log)
