@@ -49,13 +49,14 @@ from mmgsd.studies.shipped import RESULTS as SHIPPED_RESULTS
 
 VALIDATIONS = 8  # of a round
 UNSEEN = ("unseen", "unseen_workspace")  # presets
+MOST = max(ROUNDS.values())
 PAIRS, POINTS = 200, 60  # of all of a round's images, and material points asked about
 RESULTS = "rounds.json"  # in data/results
 
 
 def find_round(root: Path, object: str) -> int:
     """The last round of an object whose weights are there, 0 where none are."""
-    done = [number for number in range(1, ROUNDS + 1) if _find_file(root, object, number).is_file()]
+    done = [number for number in range(1, ROUNDS[object] + 1) if _find_file(root, object, number).is_file()]
     return max(done, default=0)
 
 
@@ -76,7 +77,7 @@ def run_round(root: Path, object: str, number: int, *, workers: int = 0) -> Path
     files = {"before": _find_file(root, object, number - 1), "after": weights}
     errors = {name: measure_images(file, data, model) for name, file in files.items() if file.is_file()}
     _keep_curve(root, object, number, weights, errors)
-    facts = {"preset": preset.name, "data_seed": number, "measured": {}}
+    facts = {"preset": preset.name, "data_seed": preset.render[object].seed, "measured": {}}
     return ship_model(weights, _find_file(root, object, number), facts)
 
 
@@ -160,8 +161,10 @@ def _describe_rounds(root: Path, object: str) -> dict[str, Any]:
     rows = read_results(root / "data" / "results" / RESULTS, depth=2).get(object, {})
     number, runs = max(map(int, rows)), [row["run"] for row in rows.values()]
     total = {name: sum(run[name] for run in runs) for name in ("images", "steps", "minutes")}
-    presets, seeds = f"presets `round1` to `round{number}` and their cluttered ones", f"1 to {number}"
-    return {**total, "preset": f"round{number}", "presets": presets, "seed": seeds, "data_seed": seeds, "measured": {}}
+    presets = f"presets `round1` to `round{number}` and their cluttered ones"
+    seeds = ", ".join(str(load_preset(f"round{k}").render[object].seed) for k in range(1, number + 1))
+    return {**total, "preset": f"round{number}", "presets": presets, "seed": f"1 to {number}", "data_seed": seeds,
+            "measured": {}}  # fmt: skip
 
 
 def average_weights(files: Sequence[Path], out: Path) -> Path:
@@ -175,7 +178,7 @@ def average_weights(files: Sequence[Path], out: Path) -> Path:
 def main(
     object: Annotated[str, Option(choices=OBJECTS)],
     *,
-    last: Annotated[int, Option("go on up to this round, or measure it", choices=range(1, ROUNDS + 1))] = ROUNDS,
+    last: Annotated[int, Option("go on up to this round, or measure it", choices=range(1, MOST + 1))] = MOST,
     render_only: Annotated[bool, Option("render the next round's images and stop")] = False,
     photographs: Annotated[Path, Option("instead measure the last round on these, with marks")] | None = None,
     ship: Annotated[bool, Option("instead calibrate the last rounds' average and ship it")] = False,
@@ -195,7 +198,7 @@ def main(
         if ship:
             print(ship_rounds(root, object, workers=workers))
         return
-    for number in range(find_round(root, object) + 1, last + 1):
+    for number in range(find_round(root, object) + 1, min(last, ROUNDS[object]) + 1):
         if render_only:
             print(render_round(root, object, number, workers=workers))
             return

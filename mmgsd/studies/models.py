@@ -125,8 +125,10 @@ MODELS = (
     Model("round1", "MMGSD, round 1", "light", {"seed": 1, "steps": by_object(cloth=4000, rope=3000)}, ("rounds",)),
     *(Model(f"round{n}", f"MMGSD, round {n}", f"round{n - 1}",
             {"seed": n, "trunk_weights": LAST_ROUND, "learning_rate": 1e-3, "sigma_start_px": 8.0,
-             "strong": by_object(cloth=n > 2, rope=True)}, ("rounds",), "MMGSD, shipped" * (n == ROUNDS), "#A6761D")
-      for n in range(2, ROUNDS + 1)),
+             "strong": by_object(cloth=n > 2, rope=True)}, ("rounds",),
+            "MMGSD, shipped" * (n == ROUNDS["cloth"]), "#A6761D",
+            tuple(object for object in OBJECTS if n <= ROUNDS[object]))
+      for n in range(2, max(ROUNDS.values()) + 1)),
     # what each part of the shipped models' training brings, one after another
     Model("mmgsd_workspace", "MMGSD, workspace renders too", "mmgsd", {"also": "workspace"}, ("robustness",),
           "+ workspace"),
@@ -144,7 +146,7 @@ UNTRAINED = (
 )
 ROWS = {row.name: row for row in (*MODELS, *UNTRAINED)}
 # row: what the names of its files in data/weights end with
-SHIPPED = {f"round{ROUNDS}": "", "mmgsd": "-paper", "spcl": "-spcl"}
+SHIPPED = {f"round{ROUNDS['cloth']}": "", "mmgsd": "-paper", "spcl": "-spcl"}
 SMALL = ("symmetry", "budget", "sigma", "fixes", "robustness", "backbones")  # studies of the equal, smaller budget
 RUN = ("first", "symmetry", "budget", "sigma", "main")  # studies that are run unless one is named, in this order
 # on a preset's own images and one seed: not "fixes" and "seeds"

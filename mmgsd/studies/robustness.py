@@ -25,7 +25,7 @@ PANELS = (  # a title, what is measured there, and times what
     ("Cluttered renders", "workspace", "rmse_mean", 1.0, "RMSE (px)"),
     ("Photographs", "photographs", "found@5%", 100.0, "Corners, ends found (%)"),
 )
-COLOURS = {"": get_colour(f"round{ROUNDS}"), "paper": get_colour("mmgsd")}
+COLOURS = {"": get_colour(f"round{ROUNDS['cloth']}"), "paper": get_colour("mmgsd")}
 COLOURS |= {name: get_colour(name) for name in (*BASELINES, *OPTIONAL)}
 LABELS = {"": "MMGSD, shipped", "paper": "MMGSD, clean images only"}
 
