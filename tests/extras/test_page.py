@@ -215,7 +215,7 @@ def test_a_tap_has_the_librarys_answer_online_and_offline(
         before = page.locator("canvas").nth(1).screenshot()
         for xy in ((235, 80), (150, 350), (300, 200)):
             found = tap(page, *xy)
-            assert compare(found, pair.match(np.array([xy]))) < 0.5
+            assert compare(found, pair.match(np.array([xy]))) < 1  # px; the page's network has half precision
         after = page.locator("canvas").nth(1).screenshot()
         assert np.mean(np.asarray(Image.open(io.BytesIO(before))) != np.asarray(Image.open(io.BytesIO(after)))) > 0.01
     page.reload(timeout=PATIENCE_MS)  # nobody serves any more
@@ -227,7 +227,7 @@ def test_a_tap_has_the_librarys_answer_online_and_offline(
     for file in files:
         page.get_by_text(file.name, exact=True).wait_for(timeout=PATIENCE_MS)
     xy = (200, 150)
-    assert compare(tap(page, *xy, size=(410, 300)), other.match(np.array([xy]))) < 0.5
+    assert compare(tap(page, *xy, size=(410, 300)), other.match(np.array([xy]))) < 1
     page.close()
 
 

@@ -14,7 +14,6 @@ from mmgsd.__main__ import main
 from mmgsd.dataset import Dataset, load_dataset
 from mmgsd.match.matcher import Matcher, find_weights
 from mmgsd.match.places import NAMES, lay_flat
-from mmgsd.measure.calibration import describe_places
 from mmgsd.measure.photographs import ask_by_name, read_photographs
 from mmgsd.model.tensors import read_tensors, write_tensors
 from mmgsd.symmetry import load_group
@@ -34,10 +33,7 @@ def data(request: pytest.FixtureRequest) -> Dataset:
 
 @pytest.fixture(scope="module")
 def matcher(data: Dataset) -> Matcher:
-    """Shipped weights that know the places as the sample shows them."""
-    matcher = mmgsd.load(data.object)
-    matcher.places = describe_places(matcher, data)
-    return matcher
+    return mmgsd.load(data.object)
 
 
 def test_a_place_by_name_is_found_in_an_image(matcher: Matcher, data: Dataset) -> None:
@@ -123,13 +119,11 @@ def test_a_file_keeps_places_and_refuses_damaged_ones(matcher: Matcher, data: Da
 
 
 def test_places_are_found_from_the_command_line(
-    matcher: Matcher, data: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    data: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    tensors, note = read_tensors(find_weights(data.object))
-    weights = write_tensors(tmp_path / "mine.safetensors", tensors | {"places": matcher.places}, note)
     image = str(data.folder / data.labels.file[0])
     names = [*NAMES[data.object], "0.25,0.5" if data.object == "cloth" else "0.25", "7"]
-    asked = ["find", image, *names, "--weights", str(weights)]
+    asked = ["find", image, *names, "--weights", data.object]
     main([*asked, "--out", str(tmp_path / "found.png")])
     assert [line.partition(" -> ")[0] for line in capsys.readouterr().out.splitlines()] == names
     assert (tmp_path / "found.png").stat().st_size > 10_000
