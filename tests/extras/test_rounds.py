@@ -123,4 +123,5 @@ def test_photographs_are_measured_of_the_last_round(root: Path, monkeypatch, cap
     monkeypatch.setattr(rounds, "measure_answers", lambda matcher, asked: {"sharp": matcher.readout.mean_exponent})
     rounds.main("cloth", photographs=Path("mine"))
     stored = json.loads((root / "data" / "results" / "rounds.json").read_text())["cloth"]["1"]
-    assert stored["photographs"] == {"sharp": shipped.readout.mean_exponent} == json.loads(capsys.readouterr().out.splitlines()[-1])
+    printed = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert stored["photographs"] == {"sharp": shipped.readout.mean_exponent} == printed
