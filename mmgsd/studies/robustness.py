@@ -53,12 +53,14 @@ def plot_robustness(rows: Rows) -> Figure:
     figure, axes = plt.subplots(1, len(PANELS), figsize=size, layout="constrained", sharey=True)
     for axis, (title, part, key, scale, unit) in zip(axes, PANELS, strict=True):
         for place, name in zip(places, names, strict=True):
-            value = (get_photographs(rows, name) if part == "photographs" else rows[name].get(part, {})).get(key)
-            _draw_bar(axis, place, name, value and scale * value)
+            found = get_photographs(rows, name) if part == "photographs" else rows[name].get(part, {})
+            value, named = found.get(key), found.get("by_name", {}).get(key)
+            _draw_bar(axis, place, name, value and scale * value, named and scale * named)
         axis.set(title=title, xlabel=unit)
     widest = 1.12 * max(1.0, *(axis.dataLim.x1 for axis in axes[:2]))
-    for axis, most in zip(axes, (widest, widest, 100), strict=True):
+    for axis, most in zip(axes, (widest, widest, 165), strict=True):  # %, with room for the words
         axis.set_xlim(0, most)
+    axes[2].set_xticks([0, 50, 100])
     kinds = [name.partition("@")[0].partition("-") for name in names]
     labels = [f"{object.capitalize()}: {LABELS.get(kind) or get_label(kind)}" for object, _, kind in kinds]
     axes[0].set_yticks(places, labels)
@@ -66,12 +68,18 @@ def plot_robustness(rows: Rows) -> Figure:
     return finish_axes(figure)
 
 
-def _draw_bar(axis: Axes, place: float, name: str, value: float | None) -> None:
+def _draw_bar(axis: Axes, place: float, name: str, value: float | None, named: float | None = None) -> None:
+    """The bar of a ``value``, dashed up to the one that asking by ``named`` places has."""
     if value is None:
         axis.annotate("not measured", (0, place), xytext=(2, 0), textcoords="offset points", va="center", fontsize=5.5)
         return
-    axis.barh(place, value, height=0.72, color=COLOURS[name.partition("@")[0].partition("-")[2]])
-    axis.annotate(f"{value:.0f}", (value, place), xytext=(2, 0), textcoords="offset points", va="center", fontsize=6.5)
+    colour = COLOURS[name.partition("@")[0].partition("-")[2]]
+    axis.barh(place, value, height=0.72, color=colour)
+    text, end = f"{value:.0f}", value
+    if named is not None:
+        axis.barh(place, named, height=0.72, fill=False, edgecolor=colour, linestyle="--", linewidth=0.8)
+        text, end = f"{value:.0f}, by name {named:.0f}", max(value, named)
+    axis.annotate(text, (end, place), xytext=(2, 0), textcoords="offset points", va="center", fontsize=6.5)
 
 
 STUDY = Study(

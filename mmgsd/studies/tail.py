@@ -228,13 +228,15 @@ def describe_tail(results: Results) -> Table:
 
 
 def describe_floors(results: Results) -> Table:
-    """What the outline leaves open, by state."""
+    """What the outline leaves open, by state, where it fits more than one way round at all."""
     columns = [Column("images", page="images", form="d"),
                Column("ways", page="outline fits more than one way round", form=".0f", scale=100),
                Column("floor_px", page="least error by the outline alone, px")]  # fmt: skip
     keys = {key: key.removeprefix("floor: ") for found in list_parts(results).values() for key in found
-            if key.startswith("floor: ")}  # fmt: skip
-    return Table("state", {"": columns}, list_rows(results, keys), list(list_parts(results)))
+            if key.startswith("floor: ") and found[key]["ways"]}  # fmt: skip
+    rows = list_rows(results, keys)
+    parts = [part for part in list_parts(results) if any(part in row for row in rows.values())]
+    return Table("state", {"": columns}, rows, parts)
 
 
 STUDY = Study(

@@ -30,4 +30,11 @@ def test_bars_are_of_one_reading() -> None:
 
 def test_errors_share_an_axis_from_zero() -> None:
     limits = [axis.get_xlim() for axis in plot_robustness(ROWS).axes]
-    assert limits[0] == limits[1] and limits[0][0] == 0 and limits[0][1] > 90 and limits[2] == (0, 100)
+    assert limits[0] == limits[1] and limits[0][0] == 0 and limits[0][1] > 90 and limits[2][0] == 0
+
+
+def test_what_is_found_by_name_is_drawn_and_said_beside_the_bar() -> None:
+    found = {"found@5%": 0.6, "by_name": {"found@5%": 0.8}}
+    axis = plot_robustness(ROWS | {"cloth": ROWS["cloth"] | {"photographs": found}}).axes[2]
+    assert [round(bar.get_width()) for bar in axis.patches[:2]] == [60, 80] and not axis.patches[1].get_fill()
+    assert axis.texts[0].get_text() == "60, by name 80" and axis.get_xticks().max() == 100
