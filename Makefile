@@ -65,7 +65,7 @@ figures: $(STAMP) ## Draw the paper's figures of PRESET (paper) again from data/
 	$(PAPERMILL) notebooks/07_figures.ipynb data/generated/figures_$(PRESET).ipynb -p preset $(PRESET) -p run True
 
 readme: $(STAMP) ## Put the numbers of data/results into README.md, the results page and docs/claims.md; make docs/api.md
-	$(PY) -m mmgsd tables data/results README.md data/results/README.md docs/claims.md
+	$(PY) -m mmgsd tables data/results README.md data/results/README.md data/results/shipped.md docs/claims.md
 	$(PY) -m mmgsd interface docs/api.md
 
 # Its tools are no part of the environment: only who builds the site needs them.

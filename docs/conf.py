@@ -28,7 +28,7 @@ CONTENTS = """
 PAGES = {
     "Use": ["docs/your-photographs", "docs/folding", "docs/page", "docs/onnx", "docs/api", "docs/reference"],
     "Make it yours": ["docs/extending", "docs/data-card", "docs/clusters-and-gpus", "CONTRIBUTING", "CHANGELOG"],
-    "Results": ["data/results/README", "docs/claims", "data/results/LOG"],
+    "Results": ["data/results/README", "data/results/shipped", "docs/claims", "data/results/LOG"],
     "Weights": sorted(f"data/weights/{path.stem}" for path in (ROOT / "data" / "weights").glob("*.md")),
 }
 

@@ -205,7 +205,7 @@ def make_sources_sentence(rows: Rows) -> str:
     """What is counted in photographs, and which public repositories they are from."""
     sources = dict.fromkeys(name for object in OBJECTS for name in rows[object]["photographs"]["sources"])
     return ("The photographs, counted as on the\n"
-            "[results page](data/results/README.md#is-it-right-about-clutter-and-photographs), are from "
+            "[results page](data/results/shipped.md#is-it-right-about-clutter-and-photographs), are from "
             f"{', '.join(f'`{name}`' for name in sources)}.")  # fmt: skip
 
 
