@@ -20,31 +20,35 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import torch
 
 from mmgsd.config import DEFAULT_GROUP, N_POINTS, EvaluateConfig, load_preset
-from mmgsd.dataset import load_dataset
+from mmgsd.dataset import Dataset, load_dataset
 from mmgsd.dataset_format import SPLITS
 from mmgsd.files import DamagedFileError, read_json
 from mmgsd.images import read_image
 from mmgsd.match.baselines import BaselineMatcher, FeatureMatcher
 from mmgsd.match.match import RADIUS_PX, Match
-from mmgsd.match.matcher import Matcher, find_weights
+from mmgsd.match.matcher import Matcher, find_weights, read_heatmap
 from mmgsd.match.mixture import AS_IT_IS, ModeReadout
+from mmgsd.match.places import NAMES
 from mmgsd.measure import uncertainty
 from mmgsd.measure.evaluation import evaluate_baseline, evaluate_model, load_queries
 from mmgsd.measure.heads import MEASURES as HEADS
 from mmgsd.measure.heads import evaluate_heads
 from mmgsd.measure.metrics import aggregate, compute_query_errors
 from mmgsd.measure.photographs import measure_answers, measure_photographs, read_photographs
+from mmgsd.measure.questions import choose_points, describe, draw_pairs
 from mmgsd.measure.regions import SIDE
 from mmgsd.model.calibration import Calibration
-from mmgsd.model.network import name_hardware
+from mmgsd.model.network import compute_cell_centres, name_hardware
 from mmgsd.paths import Paths
 from mmgsd.symmetry import load_group
 
 SETS = ("paper", "workspace")  # presets whose test images are asked about
 LEVEL = 0.9  # of the radii whose promise is checked
 HEAD_PAIRS = 100  # of images whose modes are judged
+NAMED_PAIRS, NAMED_POINTS = 60, 40  # of images, and material points that are asked about by a picture and by name
 TIMED = 9  # questions, of which the median counts
 PLAIN = ("flat", "straight")  # states of the objects
 CLOTH_LABELS, CLOTH_PICTURES = "knots_info.json", "*_rgb.png"  # of others' renders
@@ -60,8 +64,8 @@ def measure_weights(
 
     Of a set: `mmgsd.measure.metrics.aggregate` over visible sources, `mmgsd.measure.uncertainty.summarise_uncertainty`
     by the weights' own calibration, its ``reliability`` beside a Gaussian's, ``within_radius``, the share of modes with
-    a true match within `Match.radius_px` (level 0.9), and ``heads`` (`measure_heads`). ``milliseconds``: of one
-    question about two images.
+    a true match within `Match.radius_px` (level 0.9), ``heads`` (`measure_heads`), and of weights that know their
+    places ``asked`` (`measure_by_name`). ``milliseconds``: of one question about two images.
     ``presets`` are those whose images stand for `SETS`; without any, neither they nor the time are measured.
     ``cloth_renders`` of a cloth's weights: `measure_cloth_renders`.
     """
@@ -75,11 +79,41 @@ def measure_weights(
         heads = evaluate_heads(file, data, EvaluateConfig(pairs=HEAD_PAIRS), paths.queries(f"heads-{name}"),
                                progress=progress)  # fmt: skip
         row[kind] = _summarise(table, matcher) | {"heads": {key: read_json(heads)[key] for key in HEADS}}
+        if matcher.places is not None:
+            row[kind]["asked"] = measure_by_name(matcher, load_dataset(data, "test"))
     if photographs:
         row["photographs"] = measure_photographs(file, photographs, progress=progress)
     if cloth_renders and matcher.object == "cloth":
         row["cloth_renders"] = measure_cloth_renders(matcher, cloth_renders)
     return row | (_time_question(matcher, root) if presets else {})
+
+
+def measure_by_name(
+    matcher: Matcher, data: Dataset, *, pairs: int = NAMED_PAIRS, points: int = NAMED_POINTS
+) -> dict[str, float]:
+    """Mean RMSE (px) of the same questions ``by_picture``, of a first image that shows the point, and ``by_name``.
+
+    Of the material points of `NAMES`, and ``points`` others. ``pairs`` are of images that show the object.
+    """
+    group, flat, errors = data.group(matcher.config.group), matcher.lay_flat(), {"by_picture": [], "by_name": []}
+    asked = np.unique([*NAMES[data.object].values(), *choose_points(points, data.n_points)])
+    chosen = draw_pairs(data, EvaluateConfig(pairs=pairs))
+    outputs = describe(matcher, data, np.unique(chosen))
+    for first, second in chosen:
+        seen = asked[data.visible[first, asked]]
+        count = group.count_modes(seen)
+        for n in np.unique(count):
+            some = seen[count == n]
+            true = data.xy[second][np.stack([group.distinct_modes(int(point)) for point in some])].astype(float)
+            ways = {"by_picture": (outputs[first], data.xy[first, some], data.size),
+                    "by_name": (flat.outputs, flat.look_up(some.tolist())[0], flat.image.shape[1::-1])}  # fmt: skip
+            for name, (source, xy, size) in ways.items():
+                heatmap = matcher.compute_heatmaps(source, outputs[second], torch.from_numpy(xy), size)
+                centres = compute_cell_centres(data.size, heatmap.shape[-2:])
+                fit, _ = read_heatmap(heatmap, int(n), centres, readout=matcher.readout)
+                modes, covariances = (values.double().cpu().numpy() for values in (fit.modes, fit.covariances))
+                errors[name].extend(compute_query_errors(modes, covariances, true)["rmse_px"])
+    return {name: round(float(np.mean(values)), 2) for name, values in errors.items()}
 
 
 def measure_read(

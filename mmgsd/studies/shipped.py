@@ -168,17 +168,21 @@ def describe_readings(rows: Rows) -> Table:
     return describe_pictures(rows, labels)
 
 
+FORMS = {"ece": ".3f", "ece_confidence": ".3f", "by_picture": ".1f", "by_name": ".1f"}
+
+
 def describe_knowledge(rows: Rows) -> Table:
     """What shipped weights know beside the matches, and how far they keep what they promise."""
     measures = {"mask IoU": "mask_iou", "seen": "auroc_visible", "on the object": "auroc_on_object",
                 "absent": "auroc_absent", "ECE of ellipses": "ece", "of confidences": "ece_confidence",
-                "within the 90 % radius": "within_radius"}  # fmt: skip
+                "within the 90 % radius": "within_radius", "asked by a picture: RMSE px": "by_picture",
+                "by name": "by_name"}  # fmt: skip
     lines = {}
     for name in (name for object in OBJECTS for name in (object, f"{object}-paper")):
         for preset, word in SETS.items() if "calibrated" in rows.get(name, {}) else ():
             found = rows[name].get(preset, {})
-            found = {**found, **found.get("heads", {})}
-            lines[f"`{name}`, {word}"] = [say_value(found, key, 1, ".3f" if "ece" in key else ".2f")
+            found = {**found, **found.get("heads", {}), **found.get("asked", {})}
+            lines[f"`{name}`, {word}"] = [say_value(found, key, 1, FORMS.get(key, ".2f"))
                                           for key in measures.values()]  # fmt: skip
     return make_page_table(list(measures), lines)
 

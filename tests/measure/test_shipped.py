@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 from test_heads_measured import write_weights
 
+import mmgsd
 from mmgsd.config import EvaluateConfig, load_preset
+from mmgsd.dataset import load_dataset
 from mmgsd.match.matcher import Matcher
 from mmgsd.measure import shipped
-from mmgsd.measure.shipped import Masked, measure_baseline, measure_read, measure_weights
+from mmgsd.measure.shipped import Masked, measure_baseline, measure_by_name, measure_read, measure_weights
 from mmgsd.paths import Paths
 from mmgsd.studies import shipped as study
 from mmgsd.studies.models import configure_study
@@ -48,6 +50,13 @@ def test_weights_are_measured_on_both_sets(root: Path) -> None:
     for preset in shipped.SETS:
         assert 0 < row[preset]["rmse_mean"] < 700 and 0 <= row[preset]["heads"]["mask_iou"] <= 1
         assert row[preset]["within_radius"] is None and 0 <= row[preset]["ece"] <= 1
+
+
+@pytest.mark.parametrize("name", ["cloth", "rope"])
+def test_the_same_questions_are_asked_by_a_picture_and_by_name(name: str) -> None:
+    data = load_dataset(SAMPLE / name, "test")
+    found = measure_by_name(mmgsd.load(name), data, pairs=3, points=5)
+    assert found.keys() == {"by_picture", "by_name"} and all(0 < px < 60 for px in found.values())
 
 
 def test_baselines_are_measured_on_both_sets(root: Path) -> None:

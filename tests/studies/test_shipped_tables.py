@@ -23,7 +23,7 @@ FOUND = {"photographs": 34, "found@5%": 0.512, "spurious": 0.25, "unanswered": 0
 HEADS = {"mask_iou": 0.951, "auroc_visible": 0.9, "auroc_on_object": 0.98, "auroc_absent": None}
 SET = {
     "rmse_mean": 21.04, "heads": HEADS, "auroc_absent": 0.3, "ece": 0.0264, "ece_confidence": 0.01,
-    "within_radius": 0.91,
+    "within_radius": 0.91, "asked": {"by_name": 16.59},
 }  # fmt: skip
 ROWS = {
     "cloth-orb": {"paper": {"rmse_mean": 71.25}},
@@ -103,7 +103,7 @@ def test_the_parts_budget_is_said() -> None:
 
 def test_knowledge_is_of_weights_alone() -> None:
     lines = to_markdown(describe_knowledge(ROWS)).splitlines()
-    assert lines[2] == "| `cloth`, clean | 0.95 | 0.90 | 0.98 | – | 0.026 | 0.010 | 0.91 |"
+    assert lines[2] == "| `cloth`, clean | 0.95 | 0.90 | 0.98 | – | 0.026 | 0.010 | 0.91 | – | 16.6 |"
     assert not any("orb" in line.lower() for line in lines)
 
 
