@@ -86,6 +86,8 @@ def describe_limits(rows: Rows) -> Table:
         "it knows": "square cloths, and ropes whose ends look alike; anything else has to be learnt first",
         **{f"mean error, {word} renders": "; ".join(_tell_error(rows[object], preset) for object in SIDES)
            for preset, word in SETS.items()},
+        **{f"asked by name, {word} ones": "; ".join(_tell_named(rows[object], preset) for object in SIDES)
+           for preset, word in SETS.items()},
         "in photographs": "found within 5 % of the size: {} of a cloth's corners by name, {} by another picture; "
                           "of a rope's ends {} and {}".format(*seen[0], *seen[1]),
         "it takes": f"{slowest['milliseconds']:.0f} ms for two new images and a question ({slowest['hardware']}); "
@@ -99,6 +101,12 @@ def _tell_error(row: Mapping[str, Any], preset: str) -> str:
     px, size = say_value(row.get(preset), "rmse_mean", 1, ".0f", " px"), row.get("side_px")
     share = say_value(row.get(preset) if size else None, "rmse_mean", 100 / (size or 1), ".0f", " %")
     return f"{row['object']} {px}, {share} of its {SIDES[row['object']]}"
+
+
+def _tell_named(row: Mapping[str, Any], preset: str) -> str:
+    by_name, by_picture = (say_value(row.get(preset, {}).get("asked"), key, 1, ".0f", " px")
+                           for key in ("by_name", "by_picture"))  # fmt: skip
+    return f"{row['object']} {by_name} where a picture gives {by_picture}"
 
 
 def describe_pictures(rows: Rows, labels: Mapping[str, str] | None = None) -> Table:
