@@ -41,7 +41,7 @@ from mmgsd.measure.evaluation import read_results
 from mmgsd.measure.photographs import measure_answers, read_photographs
 from mmgsd.measure.questions import measure_rmse
 from mmgsd.measure.shipped import SETS
-from mmgsd.model.tensors import describe_run, read_tensors, write_tensors
+from mmgsd.model.tensors import describe_run, load_metadata, read_tensors, write_tensors
 from mmgsd.paths import Paths, find_root
 from mmgsd.scene.stage import render_dataset
 from mmgsd.studies.models import configure_study
@@ -138,7 +138,7 @@ def ship_rounds(root: Path, object: str, *, workers: int = 0) -> Path:
             _keep(root, object, number, unseen={"alone": alone, "averaged": errors[averaged]})
     chosen = min(errors, key=lambda file: sum(errors[file].values()))
     calibrate_unseen(chosen, unseen)
-    return ship_model(chosen, _find_shipped(root, object), _describe_rounds(root, object))
+    return ship_model(chosen, _find_shipped(root, object), _describe_rounds(root, object, chosen))
 
 
 def write_card(root: Path, object: str) -> Path:
@@ -149,17 +149,18 @@ def write_card(root: Path, object: str) -> Path:
         raise ValueError(f"object must be measured first, {results} has nothing of {weights}: "
                          f"python -m mmgsd run shipped {object}")  # fmt: skip
     measured = {name: row[name] for name in (*SETS, "photographs") if name in row}
-    return ship_model(weights, weights, _describe_rounds(root, object) | {"measured": measured})
+    return ship_model(weights, weights, _describe_rounds(root, object, weights) | {"measured": measured})
 
 
 def _find_shipped(root: Path, object: str) -> Path:
     return root / "data" / "weights" / f"{object}.safetensors"
 
 
-def _describe_rounds(root: Path, object: str) -> dict[str, Any]:
-    """What the card says of all rounds together."""
+def _describe_rounds(root: Path, object: str, weights: Path) -> dict[str, Any]:
+    """What the card says of all rounds together, up to the last one that the averaged ``weights`` are of."""
     rows = read_results(root / "data" / "results" / RESULTS, depth=2).get(object, {})
-    number, runs = max(map(int, rows)), [row["run"] for row in rows.values()]
+    number = max(int(name.rpartition("round")[2]) for name in json.loads(load_metadata(weights)["averaged"]))
+    runs = [row["run"] for name, row in rows.items() if int(name) <= number]
     total = {name: sum(run[name] for run in runs) for name in ("images", "steps", "minutes")}
     presets = f"presets `round1` to `round{number}` and their cluttered ones"
     seeds = ", ".join(str(load_preset(f"round{k}").render[object].seed) for k in range(1, number + 1))
