@@ -184,8 +184,9 @@ def test_every_finding_is_short_and_leads_to_a_section() -> None:
     assert all(len(f"{finding.name} {finding.sentence}".split()) <= 25 for finding in findings)
 
 
-def test_the_results_page_says_how_to_read_each_table_in_few_words() -> None:
-    page = (ROOT / "data" / "results" / "README.md").read_text("utf-8")
+@pytest.mark.parametrize("name", ["README.md", "shipped.md"])
+def test_a_results_page_says_how_to_read_each_table_in_few_words(name: str) -> None:
+    page = (ROOT / "data" / "results" / name).read_text("utf-8")
     sections = page.split("\n## ")[1:]
     for section in sections:
         assert "*The paper*" in section and "```sh" in section, section[:40]
