@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from mmgsd.files import atomic_write
 from mmgsd.match.matcher import Matcher
+from mmgsd.match.places import LIKE
 from mmgsd.model.network import compute_input_size
 from mmgsd.numerics import own_numerics
 
@@ -42,7 +43,9 @@ def export_onnx(matcher: Matcher, path: Path | str, *, half: bool = False) -> fl
 
     The file's metadata hold ``input_size`` ("width height", px, of the training's images), ``multiple_of``,
     ``least_px``, ``quarter_turns`` (averaged in the graph), ``modes``, ``temperature``, for contrastive descriptors
-    ``bandwidth``, with heads the layers of ``judge``, which says what is visible, and the training's ``config``.
+    ``bandwidth``, with heads the layers of ``judge``, which says what is visible, the training's ``config``, and with
+    a ``Matcher.shrinkage`` the ``places`` towards which sources move: ``descriptors``, the ``share``, the temperature
+    ``like``.
 
     What onnxruntime makes of random images of four shapes is compared with torch, both in single precision: returns the
     largest difference, relative to the largest value. On a CPU, where `Matcher.describe` takes bfloat16 for some of its
@@ -118,6 +121,8 @@ def _describe(matcher: Matcher, size: tuple[int, int]) -> dict[str, str]:
     if getattr(matcher.network, "heads", None):
         judge = matcher.network.heads.judge_layers
         values["judge"] = [[layer.weight.tolist(), layer.bias.tolist()] for layer in (judge[0], judge[2])]
+    if matcher.shrinkage and matcher.places is not None:
+        values["places"] = {"share": matcher.shrinkage, "like": LIKE, "descriptors": matcher.places.tolist()}
     return {name: str(value) for name, value in numbers.items()} | {n: json.dumps(v) for n, v in values.items()}
 
 

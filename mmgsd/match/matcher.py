@@ -21,7 +21,7 @@ from mmgsd.images import check_aspect, check_mask, check_pixels, to_rgb
 from mmgsd.match.joint import join, spread_places
 from mmgsd.match.match import Match, sort_modes
 from mmgsd.match.mixture import AS_IT_IS, Mixture, ModeReadout, check_count, check_modes, fit_modes, keep_most_probable
-from mmgsd.match.places import Flat, Place, lay_flat
+from mmgsd.match.places import Flat, Place, lay_flat, shrink_sources
 from mmgsd.model.calibration import Calibration
 from mmgsd.model.heads import Outputs, look_up, weigh_cells
 from mmgsd.model.network import (
@@ -77,9 +77,10 @@ class Matcher:
     def __init__(
         self, network: torch.nn.Module, config: TrainConfig, *, modes: int, size: tuple[int, int], device: str = "",
         bandwidth: float | None = None, temperature: float = 1.0, power: float = 1.0, sharpness: float = 1.0,
-        calibration: Calibration | None = None, places: Tensor | None = None,
+        calibration: Calibration | None = None, places: Tensor | None = None, shrinkage: float = 0.0,
     ) -> None:  # fmt: skip
         check_scales(bandwidth=bandwidth, temperature=temperature)
+        check("shrinkage", shrinkage, "a number from 0 to 1", 0 <= shrinkage <= 1)
         check_modes(modes)
         _check_size(size)
         self.device = torch.device(find_device(device))
@@ -91,6 +92,7 @@ class Matcher:
         self.turns = QUARTERS if config.rotate else 1  # what was trained upright knows only upright images
         self.bandwidth = config.margin / 4 if bandwidth is None and config.method in CONTRASTIVE else bandwidth
         self.places = places  # (P, D) what the object's material points are described as, None where that is not known
+        self.shrinkage = shrinkage  # of what pixels are asked about with, towards the places that they look like
 
     modes = renamed("modes", "num_modes")
     reading = renamed("reading", "readout")
@@ -200,10 +202,17 @@ class Matcher:
         """(H, W) float32 in [0, 1] of an image of ``size`` (width, height), from an `Outputs.mask` (h, w)."""
         return cv2.resize(logits.sigmoid().cpu().numpy(), size, interpolation=cv2.INTER_LINEAR)
 
-    def sample_sources(self, said0: Outputs, xy: Tensor, size: tuple[int, int]) -> Tensor:
-        """(1, S, D) what pixels ``xy`` (S, 2) of an image of ``size`` are asked about with."""
+    def sample_sources(self, said0: Outputs, xy: Tensor, size: tuple[int, int], *, shrink: bool = True) -> Tensor:
+        """(1, S, D) what pixels ``xy`` (S, 2) of an image of ``size`` are asked about with.
+
+        That is each one's descriptor; of weights with a ``shrinkage`` drawn towards the mean descriptors of the
+        places of the object that it looks like (`mmgsd.match.places.shrink`), unless ``shrink`` is false.
+        """
         sources = said0.descriptors[None, : self.config.descriptor_dim]
-        return sample_descriptors(sources, xy[None].to(self.device).float(), size)
+        sampled = sample_descriptors(sources, xy[None].to(self.device).float(), size)
+        if not shrink or self.places is None or not self.shrinkage:
+            return sampled
+        return shrink_sources(sampled, self.places.to(sampled), self.shrinkage, bandwidth=self.bandwidth)
 
     def match(
         self, image0: Any, image1: Any, xy: Any, *, n: Any = None, mask0: Any = None, mask1: Any = None,
@@ -256,7 +265,7 @@ class Matcher:
             image, _ = take_image(self, image)
             size = image.shape[1::-1]
             points = torch.from_numpy(check_pixels(xy, size, image="image"))
-            sampled.append(self.sample_sources(self.describe([image])[0], points, size)[0])
+            sampled.append(self.sample_sources(self.describe([image])[0], points, size, shrink=False)[0])
         if not sampled:
             raise ValueError("pictures must be (image, (x, y)), one or more, got none")
         return Place(torch.cat(sampled).mean(0, keepdim=True))

@@ -43,6 +43,7 @@ PICTURES = 400  # at most, that an object's places are described by
 POWERS, SHARPNESSES = (1.0, 1.25, 1.5, 2.0), (1.0, 2.0, 3.0, 4.0, 6.0, 8.0)  # of readings that are tried
 ALLOWED = 1.05  # times the RMSE of modes that are read as they are
 WIDENED = (1.0, 1.2, 1.5, 2.0)  # times the likeliest temperature
+SHRINKAGES = (0.0, 0.25, 0.5, 0.75, 1.0)
 PAIRS, LEAST_PAIRS = 400, 40  # drawn, and the fewest: half of these can just tell the level of 95 %
 
 
@@ -68,6 +69,7 @@ def calibrate_weights(
         raise ValueError(f"dataset must be the one that {weights} was trained on, of fingerprint {note.get('data')}: "
                          f"{dataset} has {data.fingerprint}")  # fmt: skip
     held_out = join_datasets(*(hold_out(part)[1] for part in parts))
+    matcher.places = describe_places(matcher, held_out)
     how = {"pairs": pairs, "points": points, "progress": progress}
     return _calibrate(weights, matcher, held_out, {}, "dataset must hold out", **how)
 
@@ -80,8 +82,8 @@ def calibrate_unseen(
     """The same by the test images of data sets that were not trained on, from which a reading is chosen first.
 
     ``unseen`` are their folders, one or more, of other seeds than those that the weights are measured on. The reading
-    (`choose_temperature`, `choose_readout`) is kept as ``temperature``, ``power`` and ``sharpness``, the fingerprints
-    as ``unseen``.
+    (`choose_temperature`, `choose_shrinkage`, `choose_readout`) is kept as ``temperature``, ``shrinkage``, ``power``
+    and ``sharpness``, the fingerprints as ``unseen``.
     Errors are those of `calibrate_weights`, and ValueError where a data set is that of the training.
     """
     overwrite, weights = read_flag("overwrite", overwrite), Path(weights)
@@ -93,10 +95,13 @@ def calibrate_unseen(
         if part.fingerprint == note.get("data"):
             raise ValueError(f"unseen must be data sets that {weights} was not trained on, got that: {part.folder}")
     data = join_datasets(*parts)
+    matcher.places, matcher.shrinkage = describe_places(matcher, data), 0.0
     choose_temperature(matcher, data)
+    choose_shrinkage(matcher, data)
     readout = choose_readout(matcher, data, progress=read_flag("progress", progress))
-    chosen = {"temperature": repr(matcher.temperature), "power": repr(readout.exponent),
-              "sharpness": repr(readout.mean_exponent), "unseen": json.dumps([part.fingerprint for part in parts])}
+    chosen = {"temperature": repr(matcher.temperature), "shrinkage": repr(matcher.shrinkage),
+              "power": repr(readout.exponent), "sharpness": repr(readout.mean_exponent),
+              "unseen": json.dumps([part.fingerprint for part in parts])}  # fmt: skip
     how = {"pairs": pairs, "points": points, "progress": progress}
     return _calibrate(weights, matcher, data, chosen, "unseen must hold test", **how)
 
@@ -105,14 +110,14 @@ def _calibrate(
     weights: Path, matcher: Matcher, data: Dataset, chosen: dict[str, str], accepted: str, *,
     pairs: int, points: int, progress: bool,
 ) -> Path:  # fmt: skip
-    """Add to a file of weights what was ``chosen``, what its modes hold on ``data``, and the object's places."""
+    """Add to a file of weights what was ``chosen``, what its modes hold on ``data``, and the matcher's places."""
     pairs, points = read_count("pairs", pairs, least=LEAST_PAIRS), read_count("points", points, least=1)
     found = calibrate_modes(matcher, data, pairs=pairs, points=points, progress=read_flag("progress", progress))
     if found is None:
         raise ValueError(f"{accepted} images for at least {LEAST_PAIRS} pairs, got {len(data)} images")
-    places = describe_places(matcher, data).cpu()
     tensors, note = read_tensors(weights)
-    return write_tensors(weights, tensors | {PLACES: places}, {**note, **chosen, "calibration": found.to_json()})
+    tensors |= {PLACES: matcher.places.cpu()}
+    return write_tensors(weights, tensors, {**note, **chosen, "calibration": found.to_json()})
 
 
 def choose_temperature(matcher: Matcher, data: Dataset, *, pairs: int = 60, points: int = 40) -> float:
@@ -131,6 +136,21 @@ def choose_temperature(matcher: Matcher, data: Dataset, *, pairs: int = 60, poin
     return matcher.temperature
 
 
+def choose_shrinkage(matcher: Matcher, data: Dataset, *, pairs: int = 120, points: int = 40) -> float:
+    """The share of `SHRINKAGES` with the least mean error on ``data``, which must not have been trained on.
+
+    By it what a pixel is asked about with moves towards the places that it looks like (`Matcher.sample_sources`).
+    Leaves it set on the matcher, which must know the object's places, and returns it.
+    """
+    config, errors = EvaluateConfig(pairs=pairs, points=points), {}
+    answer = model_answer(matcher, data, config)
+    for share in SHRINKAGES:
+        matcher.shrinkage = share
+        errors[share] = measure_mean_error(answer, matcher, data, config)
+    matcher.shrinkage = min(errors, key=errors.get)
+    return matcher.shrinkage
+
+
 @own_numerics()
 def describe_places(matcher: Matcher, data: Dataset) -> Tensor:
     """What `Matcher.find` asks about, (P, D): the mean descriptor of each material point and its like ones.
@@ -145,7 +165,7 @@ def describe_places(matcher: Matcher, data: Dataset) -> Tensor:
         for index, outputs in describe(matcher, data, batch).items():
             points = torch.from_numpy(data.visible[index])
             xy = torch.from_numpy(data.xy[index][data.visible[index]])
-            total[points] += matcher.sample_sources(outputs, xy, data.size)[0].double().cpu()
+            total[points] += matcher.sample_sources(outputs, xy, data.size, shrink=False)[0].double().cpu()
             seen[points] += 1
     orbits = torch.from_numpy(data.group(matcher.config.group).permutations.T.copy())  # (P, G)
     mean, known = total[orbits].sum(1) / seen[orbits].sum(1).clamp(min=1), seen[orbits].sum((1, 2)) > 0

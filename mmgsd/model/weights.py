@@ -28,6 +28,12 @@ def _at_least_one(text: str) -> float:
     return float(text)
 
 
+def _share(text: str) -> float:
+    if not 0 <= float(text) <= 1:
+        raise ValueError("no share")
+    return float(text)
+
+
 def _parse_json(text: str, kind: type) -> Any:
     values = json.loads(text)
     if not isinstance(values, kind):
@@ -43,6 +49,7 @@ METADATA = {  # what reads a value of it, and what it must be
     "temperature": (float, "a number greater than 0"),
     "power": (_at_least_one, "a number of at least 1"),
     "sharpness": (_at_least_one, "a number of at least 1"),
+    "shrinkage": (_share, "a number from 0 to 1"),
     "calibration": (parse_calibration, "what `python -m mmgsd calibrate` writes, tables of numbers that ascend"),
 }
 NEEDED = ("config", "modes", "size")  # others not every file has

@@ -48,12 +48,12 @@ def test_the_program_of_the_docs_matches_as_the_library_does(matcher: Matcher, s
     match = pair.match(xy)
     np.testing.assert_allclose(said["heat"], match.cells, atol=1e-4 * match.cells.max())
     sizes = tuple(image.shape[1::-1] for image in images)
-    places = torch.from_numpy(said["places"])[None]
-    visible = matcher.compute_visible(*pair.outputs, torch.from_numpy(xy), places, sizes)
+    modes = torch.from_numpy(said["modes"])[None]
+    visible = matcher.compute_visible(*pair.outputs, torch.from_numpy(xy), modes, sizes)
     np.testing.assert_allclose(said["visible"], visible[0], atol=1e-3)
     np.testing.assert_allclose(1 - said["present"], match.absent[0], atol=1e-3)
     np.testing.assert_allclose(said["said1"]["mask"], pair.outputs[1].mask, atol=1e-2)
-    apart = np.linalg.norm(said["places"][:, None] - match.modes[0], axis=-1)
+    apart = np.linalg.norm(said["modes"][:, None] - match.modes[0], axis=-1)
     assert apart.min(0).max() < 16 and apart.min(1).max() < 16  # px: a cell
 
 

@@ -13,7 +13,7 @@ import mmgsd
 from mmgsd.__main__ import main
 from mmgsd.dataset import Dataset, load_dataset
 from mmgsd.match.matcher import Matcher, find_weights
-from mmgsd.match.places import NAMES, lay_flat
+from mmgsd.match.places import NAMES, lay_flat, shrink_sources
 from mmgsd.measure.photographs import ask_by_name, read_photographs
 from mmgsd.model.tensors import read_tensors, write_tensors
 from mmgsd.symmetry import load_group
@@ -80,6 +80,36 @@ def test_several_pictures_of_a_place_are_averaged(matcher: Matcher, data: Datase
         matcher.average([])
     with pytest.raises(ValueError, match="xy"):
         matcher.average([(data.load_image(0), (-9, 3))])
+
+
+def test_sources_move_towards_the_places_that_they_look_like() -> None:
+    places = torch.tensor([[0.0, 0.0], [2.0, 0.0], [9.0, 9.0]])
+    sources = torch.tensor([[[0.0, 1.0], [1.0, 1.0], [8.0, 9.0]]])  # near the first, between two, near the last
+    whole = torch.tensor([[[0.0, 0.0], [1.0, 0.0], [9.0, 9.0]]])
+    torch.testing.assert_close(shrink_sources(sources, places, 1.0), whole, atol=1e-3, rtol=0)
+    torch.testing.assert_close(shrink_sources(sources, places, 0.5), (sources + whole) / 2, atol=1e-3, rtol=0)
+    torch.testing.assert_close(shrink_sources(sources, places, 0.0), sources)
+    wide = shrink_sources(sources, places, 1.0, bandwidth=1000.0)  # where one distance is as good as another
+    torch.testing.assert_close(wide, places.mean(0).expand(1, 3, 2), atol=0.1, rtol=0)
+
+
+def test_what_pixels_are_asked_with_shrinks_and_what_places_are_hardly_moves(data: Dataset) -> None:
+    matcher = mmgsd.load(data.object)
+    matcher.shrinkage = 0.5
+    said, xy = matcher.describe([data.load_image(0)])[0], torch.from_numpy(data.xy[0][data.visible[0]])
+    raw, shrunk = (matcher.sample_sources(said, xy, data.size, shrink=shrink)[0] for shrink in (False, True))
+    nearest = [torch.cdist(sources, matcher.places).amin(1).mean() for sources in (raw, shrunk)]
+    assert nearest[1] < (1 - 0.8 * matcher.shrinkage) * nearest[0]
+    flat = matcher.lay_flat()
+    own = matcher.sample_sources(flat.outputs, torch.from_numpy(flat.xy), flat.image.shape[1::-1])[0]
+    moved = (own - matcher.places).norm(dim=1) / matcher.places.norm(dim=1)
+    assert moved.mean() < 0.02 and moved.max() < 0.1
+
+
+def test_a_share_is_from_0_to_1(matcher: Matcher) -> None:
+    for wrong in (-0.1, 1.1, float("nan")):
+        with pytest.raises(ValueError, match="shrinkage"):
+            Matcher(matcher.network, matcher.config, modes=2, size=(64, 64), shrinkage=wrong)
 
 
 def test_other_places_are_refused(matcher: Matcher, data: Dataset) -> None:

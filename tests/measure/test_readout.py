@@ -13,7 +13,16 @@ from mmgsd.dataset import load_dataset
 from mmgsd.match.matcher import Matcher
 from mmgsd.match.mixture import ModeReadout
 from mmgsd.measure import calibration
-from mmgsd.measure.calibration import ALLOWED, POWERS, SHARPNESSES, choose_readout, count_seen
+from mmgsd.measure.calibration import (
+    ALLOWED,
+    POWERS,
+    SHARPNESSES,
+    SHRINKAGES,
+    choose_readout,
+    choose_shrinkage,
+    count_seen,
+    describe_places,
+)
 from mmgsd.model.network import build_network
 
 
@@ -46,6 +55,26 @@ def test_a_reading_that_costs_too_much_error_is_not_chosen(
     chosen = choose_readout(matcher, load_dataset(cloth_dataset, "test"), pairs=2, points=4)
     assert chosen == matcher.readout == ModeReadout(matcher.config.roundness, 1.5, 8.0)
     assert 1 + 0.01 * 0.5 * 8 <= ALLOWED < 1 + 0.01 * 8
+
+
+@pytest.mark.parametrize("best", SHRINKAGES)
+def test_the_share_with_the_least_error_is_chosen(
+    matcher: Matcher, cloth_dataset: Path, monkeypatch: pytest.MonkeyPatch, best: float
+) -> None:
+    def measure(answer: object, asked: Matcher, *_: object) -> float:
+        return 20 + abs(asked.shrinkage - best)
+
+    monkeypatch.setattr(calibration, "measure_mean_error", measure)
+    assert choose_shrinkage(matcher, load_dataset(cloth_dataset, "test"), pairs=2, points=4) == best
+    assert matcher.shrinkage == best
+
+
+def test_a_share_is_chosen_by_images(matcher: Matcher, cloth_dataset: Path) -> None:
+    data = load_dataset(cloth_dataset, "test")
+    matcher.places = describe_places(matcher, data)
+    chosen = choose_shrinkage(matcher, data, pairs=2, points=9)
+    assert chosen in SHRINKAGES
+    torch.testing.assert_close(describe_places(matcher, data), matcher.places)  # which are of what is not shrunk
 
 
 def test_a_reading_is_chosen_by_images(matcher: Matcher, cloth_dataset: Path) -> None:

@@ -102,6 +102,8 @@ STORED = dataclasses.asdict(CONFIG)
         ("temperature", "nan", "temperature must be finite and greater than 0, got nan"),
         ("power", "strong", "'power' of its metadata must be a number of at least 1, got 'strong'"),
         ("sharpness", "nan", "'sharpness' of its metadata must be a number of at least 1, got 'nan'"),
+        ("shrinkage", "1.5", "'shrinkage' of its metadata must be a number from 0 to 1, got '1.5'"),
+        ("shrinkage", "nan", "'shrinkage' of its metadata must be a number from 0 to 1, got 'nan'"),
         ("bandwidth", "-0.5", "bandwidth must be finite and greater than 0, got -0.5"),
         ("calibration", "{}", "'calibration' of its metadata must be what .*calibrate"),
         ("format", None, "holds no mmgsd weights: its metadata says format None"),

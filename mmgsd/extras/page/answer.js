@@ -124,10 +124,25 @@ function normalise(values) {
   return values.map((value) => value / total);
 }
 
+// `mmgsd.match.places.shrink_sources`
+function shrinkSource(source, { bandwidth, places }) {
+  if (!places) return source;
+  const { descriptors, like, share } = places;
+  const measure = (place) => place.reduce((total, value, k) => total + (value - source[k]) ** 2, 0);
+  const squared = descriptors.map(measure);
+  const least = squared.reduce((a, b) => Math.min(a, b));
+  const scale = like * (bandwidth === null ? 1 : 2 * bandwidth ** 2);
+  const weights = normalise(squared.map((value) => Math.exp((least - value) / scale)));
+  return source.map((value, k) => {
+    const mean = weights.reduce((total, weight, place) => total + weight * descriptors[place][k], 0);
+    return value + share * (mean - value);
+  });
+}
+
 // The answer about one pixel `xy` of the first image, as `python -m mmgsd match --json` says it, with its heatmap and
 // ellipses. Images are {size, outputs}.
 export function match(image0, image1, xy, model) {
-  const source = sample(part(image0.outputs.descriptors, 0, model.dim), xy, image0.size);
+  const source = shrinkSource(sample(part(image0.outputs.descriptors, 0, model.dim), xy, image0.size), model);
   const [, rows, columns] = image1.outputs.descriptors.shape;
   const heat = computeHeatmap(source, image1.outputs, model);
   const { state, outside } = fitModes(heat, [rows, columns], model.modes, model.mixture);
