@@ -360,7 +360,8 @@ def calibrate(
     matcher = mmgsd.load(calibrated(weights, data or unseen, overwrite=overwrite))
     found, readout = matcher.calibration, matcher.readout
     print(f"{weights}: modes read with power {readout.exponent:g} and sharpness {readout.mean_exponent:g}, "
-          f"sources with shrinkage {matcher.shrinkage:g}; calibrated on {found.pairs} pairs of held-out simulations; each half by the other: "
+          f"sources with shrinkage {matcher.shrinkage:g}; "
+          f"calibrated on {found.pairs} pairs of held-out simulations; each half by the other: "
           f"ECE {found.ece_ellipse:.3f} of ellipses, {found.ece_confidence:.3f} of confidences")  # fmt: skip
 
 

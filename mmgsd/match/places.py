@@ -93,7 +93,8 @@ def shrink_sources(sources: Tensor, places: Tensor, share: float, *, bandwidth: 
     """Descriptors (…, S, D) moved by a ``share`` of the way to the object's places (P, D) that they are likest to.
 
     One picture shows a pixel of an object in one way, which the mean over many does not have. Towards one place, or
-    between some that are about as near: their mean by a heatmap over the places of a temperature of `LIKE`. The share is chosen on renders (`mmgsd.measure.calibration.choose_shrinkage`).
+    between some that are about as near: to their mean by a heatmap over the places of a temperature of `LIKE`. The
+    share is chosen on renders (`mmgsd.measure.calibration.choose_shrinkage`).
     """
     squared = torch.cdist(sources, places) ** 2
     like = torch.softmax(-squared / (LIKE * (1 if bandwidth is None else 2 * bandwidth**2)), -1)
