@@ -31,8 +31,8 @@ MEASURES = "3"  # to be raised where the same answers are measured in another wa
 
 def evaluate_model(
     weights: Path, dataset: Path, config: EvaluateConfig, out: Path, *, group: str = "", modes: int = 0,
-    temperature: float | None = None, readout: ModeReadout | None = None, overwrite: bool = False,
-    progress: bool = True,
+    temperature: float | None = None, readout: ModeReadout | None = None, shrinkage: float | None = None,
+    overwrite: bool = False, progress: bool = True,
 ) -> Path:  # fmt: skip
     """Ask a trained model all queries and write the table ``out`` (Parquet).
 
@@ -40,9 +40,10 @@ def evaluate_model(
 
     The true matches are those of ``group`` ("" is the object's own), whatever the model was taught. As many modes are
     fitted as a query has true matches, but at least ``modes``: of these the most probable ones are the answer.
-    ``temperature`` of the heatmaps is the model's own, calibrated one unless given, and so is the ``readout`` of their
-    modes. ValueError for ``modes`` that are not from 0 to `mmgsd.config.MAX_MODES`, for another ``temperature`` than a
-    number above 0, and for weights that were taught another object than the data set shows.
+    ``temperature`` of the heatmaps is the model's own, calibrated one unless given, and so are the ``readout`` of their
+    modes and the ``shrinkage`` of sources. ValueError for ``modes`` that are not from 0 to `mmgsd.config.MAX_MODES`,
+    for another ``temperature`` than a number above 0, and for weights that were taught another object than the data
+    set shows.
     """
     modes = read_count("modes", modes)
     if modes:
@@ -52,6 +53,7 @@ def evaluate_model(
     method += "" if temperature is None else f" at temperature {temperature:g}"
     method += f" of {modes} modes" if modes else ""
     method += f" by {readout}" if readout else ""
+    method += "" if shrinkage is None else f" shrunk by {shrinkage:g}"
 
     def make_answer(data: Dataset) -> AnswerFunction:
         """The weights' answers, read as they are asked to."""
@@ -60,6 +62,8 @@ def evaluate_model(
             matcher.temperature = temperature
         if readout is not None:
             matcher.readout = readout
+        if shrinkage is not None:
+            matcher.shrinkage = shrinkage
         return model_answer(matcher, data, config)
 
     how = {"overwrite": overwrite, "progress": progress}

@@ -122,19 +122,21 @@ def measure_read(
 ) -> dict[str, Any]:  # fmt: skip
     """The row of shipped weights whose modes are read otherwise: "cloth@1,1" with power 1 and sharpness 1, at means.
 
+    A third number is the ``shrinkage`` of sources: "cloth@1,1,0" without any.
     `mmgsd.measure.metrics.aggregate` over visible sources of each of ``presets``, photographs and others' renders.
     ValueError for other numbers, FileNotFoundError for other weights.
     """
     weights, _, numbers = name.partition("@")
     file = find_weights(weights)
     matcher = Matcher.load(file)
-    readout = matcher.readout = parse_readout(numbers, matcher.readout)
+    readout, matcher.shrinkage = parse_readout(numbers, matcher.readout, matcher.shrinkage)
+    matcher.readout = readout
     row = _describe_weights(file, matcher)
     for preset in presets:
         paths = Paths(root, preset)
         data, out = paths.dataset(matcher.object), paths.queries(f"shipped-{name}")
         queries = load_queries(evaluate_model(file, data, load_preset(preset).evaluate, out, readout=readout,
-                                              progress=progress))  # fmt: skip
+                                              shrinkage=matcher.shrinkage, progress=progress))  # fmt: skip
         row[preset] = aggregate(queries[queries.visible])
     if photographs:
         row["photographs"] = measure_answers(matcher, read_photographs(photographs, matcher.object), progress=progress)
@@ -146,7 +148,8 @@ def measure_read(
 def _describe_weights(file: Path, matcher: Matcher, **known: Any) -> dict[str, Any]:
     """What a row says of its weights, and how they are read."""
     weights = {"object": matcher.object, "sha256": hashlib.sha256(file.read_bytes()).hexdigest(), **known}
-    return {**weights, "power": matcher.readout.exponent, "sharpness": matcher.readout.mean_exponent}
+    readout = {"power": matcher.readout.exponent, "sharpness": matcher.readout.mean_exponent}
+    return weights | readout | {"shrinkage": matcher.shrinkage}
 
 
 def name_read(name: str, row: Mapping[str, Any]) -> str:
@@ -155,13 +158,19 @@ def name_read(name: str, row: Mapping[str, Any]) -> str:
     return name if power == sharpness == 1 else f"{name}@{power:g},{sharpness:g}"
 
 
-def parse_readout(text: str, like: ModeReadout) -> ModeReadout:
-    """The reading that "power,sharpness" says, as round as ``like``; ValueError for anything else."""
+def parse_readout(text: str, like: ModeReadout, shrinkage: float = 0.0) -> tuple[ModeReadout, float]:
+    """The reading that "power,sharpness" says, as round as ``like``, and the shrinkage that a third number says.
+
+    Without one ``shrinkage`` it is. ValueError for anything else.
+    """
     try:
-        power, sharpness = map(float, text.split(","))
+        power, sharpness, share = map(float, [*text.split(","), *([shrinkage] if text.count(",") == 1 else [])])
+        if not 0 <= share <= 1:
+            raise ValueError("no share")
     except ValueError:
-        raise ValueError(f"a reading must be POWER,SHARPNESS, two numbers from 1 on, got {text!r}") from None
-    return dataclasses.replace(like, exponent=power, mean_exponent=sharpness)
+        raise ValueError("a reading must be POWER,SHARPNESS, two numbers from 1 on, or with SHRINKAGE, one from 0 to "
+                         f"1, got {text!r}") from None  # fmt: skip
+    return dataclasses.replace(like, exponent=power, mean_exponent=sharpness), share
 
 
 def _summarise(table: Path, matcher: Matcher) -> dict[str, Any]:

@@ -42,6 +42,7 @@ class Way:
 
     label: str
     temperature: float | None = None  # of the heatmaps; 0: that with the least error on half of the pairs
+    shrinkage: float | None = None  # of sources towards the places that they look like
     means: bool = False  # modes at the means of their shares, however the weights are read
     turned: bool = False  # heatmaps of the target's quarter turns are averaged, not descriptors
     flipped: bool = False  # and those of both images' mirror images
@@ -52,6 +53,8 @@ WAYS = {
     "shipped": Way("as it is shipped"),
     "temperature 1": Way("temperature 1", temperature=1.0),
     "least error": Way("temperature of the least error", temperature=0.0),
+    "unshrunk": Way("sources as they are described", shrinkage=0.0),
+    "places": Way("sources as their places are on average", shrinkage=1.0),
     "means": Way("modes at the means of their shares", means=True),
     "turned": Way("heatmaps of four turns averaged", turned=True),
     "flipped": Way("heatmaps of both mirror images averaged", flipped=True),
@@ -68,11 +71,11 @@ def measure_ways(
     matcher: Matcher, data: Dataset, *, config: EvaluateConfig = QUESTIONS, ways: Mapping[str, Way] = WAYS
 ) -> dict[str, dict[str, float]]:
     """{way: its errors} over the queries with a visible source of every second pair."""
-    found, before = {}, matcher.temperature
+    found, before, shrinkage = {}, matcher.temperature, matcher.shrinkage
     images = _describe_all(matcher, data, config)
     for name, way in ProgressBar(ways.items(), desc=f"ways of {matcher.config.object}", total=len(ways)):
         scales = [before * factor for factor in TEMPERATURES] if way.temperature == 0 else [way.temperature or before]
-        tables = {}
+        tables, matcher.shrinkage = {}, shrinkage if way.shrinkage is None else way.shrinkage
         for scale in scales:
             matcher.temperature = scale
             table = ask(_make_answer(matcher, data, config, way, images), data, config, matcher.config.group, False, "")
@@ -80,7 +83,7 @@ def measure_ways(
         best = min(tables, key=lambda scale: tables[scale].rmse_px[tables[scale].pair % 2 == 1].mean())
         kept = tables[best][tables[best].pair % 2 == 0]
         found[name] = {**aggregate(kept), "temperature": best}
-    matcher.temperature = before
+    matcher.temperature, matcher.shrinkage = before, shrinkage
     return found
 
 

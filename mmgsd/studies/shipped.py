@@ -2,6 +2,7 @@
 
     python -m mmgsd run shipped cloth cloth-paper orb --photographs FOLDER    -> data/results/shipped.json
     python -m mmgsd run shipped cloth@1,1 --photographs FOLDER     its modes read with another power and sharpness
+    python -m mmgsd run shipped cloth@1,1,0 …      and what it is asked with not shrunk towards places
     python -m mmgsd run shipped robustness --photographs FOLDER    the models of that study, once they are trained
     python -m mmgsd run shipped cloth --cloth-renders FOLDER       and others' renders of a cloth
 
@@ -42,6 +43,7 @@ RESULTS = "shipped.json"
 NAMES = ", ".join((*BASELINES, *OPTIONAL, *STUDIES))  # that may be measured besides weights
 Rows = Mapping[str, Mapping[str, Any]]  # data/results/shipped.json, {name: what `mmgsd.measure.shipped` found}
 SETS = {"paper": "clean", "workspace": "cluttered"}  # test images: what readers know them as
+READ = "@POWER,SHARPNESS or @POWER,SHARPNESS,SHRINKAGE"
 SIDES = {"cloth": "side", "rope": "length"}  # of what an error is a share
 READING = ("power", "sharpness")
 ROUND_HEADS = ("steps so far", "clean: RMSE px", "cluttered", "averaged with all later rounds: clean", "cluttered",
@@ -144,7 +146,9 @@ def make_reading_sentence(rows: Rows) -> str:
     said = [f"power {rows[object]['power']:g}, sharpness {rows[object]['sharpness']:g} ({object})"
             for object in OBJECTS]  # fmt: skip
     apart = [f"those of `{object}` and `{object}-paper` {_tell_apart(rows, object)}" for object in OBJECTS]
-    return f"All are read with {' or '.join(said)}. 95 % intervals by photographs: {', '.join(apart)}."
+    shares = [f"{rows[object]['shrinkage']:g} ({object})" for object in OBJECTS if rows[object].get("shrinkage")]
+    shrunk = f"; the shipped weights shrink sources by {' and '.join(shares)}" if shares else ""
+    return f"All are read with {' or '.join(said)}{shrunk}. 95 % intervals by photographs: {', '.join(apart)}."
 
 
 def _tell_apart(rows: Rows, object: str) -> str:
@@ -173,6 +177,8 @@ def describe_readings(rows: Rows) -> Table:
         row = rows[name]
         if (numbers or again) and {"photographs", *SETS} & row.keys():
             labels[name] = f"`{weights}`, power {row['power']:g}, sharpness {row['sharpness']:g}"
+            if row.get("shrinkage") or numbers.count(",") == 2:
+                labels[name] += f", shrinkage {row['shrinkage']:g}"
     return describe_pictures(rows, labels)
 
 
@@ -296,7 +302,7 @@ def run(paths: Paths, *, names: Sequence[str] = ("cloth", "rope", "cloth-paper",
 
 
 def main(
-    *names: Annotated[str, Option(f"weights in data/weights, alone or with @POWER,SHARPNESS, {NAMES}", metavar="NAME")],
+    *names: Annotated[str, Option(f"weights in data/weights, alone or with {READ}, {NAMES}", metavar="NAME")],
     photographs: Annotated[Path, Option("marked photographs, with index.json", metavar="FOLDER")] | None = None,
     photographs_alone: Annotated[bool, Option("leave the presets' test images out: they take longest")] = False,
     cloth_renders: Annotated[Path, Option("others' renders, with knots_info.json", metavar="FOLDER")] | None = None,

@@ -81,17 +81,22 @@ def test_parts_are_told_one_after_another() -> None:
     assert lines[2].endswith("| 21.0 | 99.0 |")  # of photographs nothing was measured
 
 
+OWN = "| cloth, `cloth`, power 1.5, sharpness 4"
+
+
 def test_ways_of_reading_stand_beside_the_weights_own() -> None:
     means, own = {"power": 1.0, "sharpness": 1.0}, {"power": 1.5, "sharpness": 4.0}
     rows = {
         "rope": {**own}, "cloth-spcl@1,6": {**own, "cloth_renders": {}},
         "cloth@1,1": {**means, "paper": {"rmse_mean": 25.6}},
-        "cloth": {**own, **ROWS["cloth"]},
+        "cloth": {**own, **ROWS["cloth"], "shrinkage": 0.5},
+        "cloth@1.5,4,0": {**own, "paper": {"rmse_mean": 23.0}, "shrinkage": 0.0},
     }  # fmt: skip
     lines = to_markdown(describe_readings(rows)).splitlines()
     assert lines[2:] == [
-        "| cloth, `cloth`, power 1.5, sharpness 4 | 21.0 | 21.0 | 51 % (40 to 62) | 25 % | 31 % | 8.0 % |",
+        f"{OWN}, shrinkage 0.5 | 21.0 | 21.0 | 51 % (40 to 62) | 25 % | 31 % | 8.0 % |",
         "| cloth, `cloth`, power 1, sharpness 1 | 25.6 | – | – | – | – | – |",
+        f"{OWN}, shrinkage 0 | 23.0 | – | – | – | – | – |",
     ]
 
 
