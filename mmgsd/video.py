@@ -95,6 +95,7 @@ def writing_video(path: Path, rate: float) -> Iterator[Callable[[np.ndarray], No
         kind = cv2.VideoWriter_fourcc(*CODECS[inside.suffix])
 
         def write(frame: np.ndarray) -> None:
+            """Add a frame; the first one opens the file."""
             if not (writer.isOpened() or writer.open(str(inside), cv2.CAP_FFMPEG, kind, rate, frame.shape[1::-1])):
                 raise RuntimeError(f"this OpenCV cannot write {path.suffix} videos: choose another of {[*CODECS]}")
             writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))

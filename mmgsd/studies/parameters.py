@@ -73,6 +73,7 @@ def one_of(choices: Collection[str]) -> Reader:
     """A reader of one of some names."""
 
     def read(name: str, value: Any) -> str:
+        """The choice, without blanks around it."""
         check(name, value, describe_choices(value, choices), isinstance(value, str) and value.strip() in choices)
         return value.strip()
 
@@ -103,6 +104,7 @@ def number(*, above: float | None = None, least: float = -math.inf, most: float 
 
 def _numbers(accepted: str, fits: Callable[[float], bool], kind: type) -> Reader:
     def read(name: str, value: Any) -> Any:
+        """The number, of the kind that is asked for."""
         found = _to_number(value)
         check(name, value, accepted, found is not None and fits(found))
         return kind(found)
@@ -115,6 +117,7 @@ def listed(reader: Reader, *, least: int = 0, most: float = math.inf) -> Reader:
     accepted = f"a list, its length {least if least == most else _describe_range(least, most)}"
 
     def read(name: str, value: Any) -> list:
+        """Each item as ``reader`` reads it."""
         items = _to_list(value)
         check(name, value, accepted, items is not None and least <= len(items) <= most)
         return [reader(f"each of {name}", item) for item in items]
@@ -126,6 +129,7 @@ def optional(reader: Reader) -> Reader:
     """A reader that takes "" (or None) as well, and returns "" then."""
 
     def read(name: str, value: Any) -> Any:
+        """What ``reader`` reads, or ""."""
         if value is None or value == "":
             return ""
         try:

@@ -31,6 +31,7 @@ def describe_seeds(results: Results) -> Table:
     tested = compare_seeds(results)
 
     def say(name: str, method: str) -> str | None:
+        """Mean and spread over the seeds, and whether tests tell it from MMGSD's."""
         said, (alone, corrected) = say_seeds(results.get(name, {}), method), tested.get((name, method), (1.0, 1.0))
         return f"{said}{' *' if corrected < LEVEL else ' †' if alone < LEVEL else ''}" if said else None
 
@@ -93,6 +94,7 @@ def count_findings(results: Results) -> dict[str, str]:
     tested = compare_seeds(results["seeds_1000"])
 
     def say_apart(method: str) -> str:
+        """On which of the objects tests tell a method from MMGSD."""
         found = [name for name in OBJECTS if tested.get((name, method), (1.0, 1.0))[1] < LEVEL]
         return {0: "on neither", len(OBJECTS): "on both"}.get(len(found), f"on the {' and '.join(found)} alone")
 

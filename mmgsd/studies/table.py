@@ -87,6 +87,7 @@ def lay_out(table: Table, *, page: bool) -> Layout:
 
 def _list_lines(table: Table, columns: Sequence[Column], parts: Sequence[str], *, page: bool) -> list[list[str]]:
     def say(column: Column, row: Results | None, mark: str) -> str:
+        """A cell of the table."""
         missing = not row or (mark and column.key not in row)
         return MISSING if missing else f"{mark}{column.say(row, page=page)}{mark}"
 

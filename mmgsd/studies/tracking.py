@@ -85,6 +85,7 @@ def flow_lucas_kanade(object: str, frames: np.ndarray, xy: np.ndarray) -> Answer
     """OpenCV's pyramidal Lucas and Kanade, from each frame to the next."""
 
     def step(before: np.ndarray, after: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where points (P, 2) px are a frame later, and which (P,) were followed."""
         moved, found, _ = cv2.calcOpticalFlowPyrLK(before, after, points.astype(np.float32)[:, None], None)
         return moved[:, 0], found[:, 0] > 0
 
@@ -96,6 +97,7 @@ def flow_dis(object: str, frames: np.ndarray, xy: np.ndarray) -> Answer:
     search = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
 
     def step(before: np.ndarray, after: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where points (P, 2) px are a frame later, and which (P,) were followed."""
         x, y = np.moveaxis(points.astype(np.float32), -1, 0)
         flow = cv2.remap(search.calc(before, after, None), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return points + flow.reshape(-1, 2), np.ones(len(points), bool)
