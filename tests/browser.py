@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import http.server
 import os
 import re
 import shutil
 import socket
 import subprocess
 import sys
+import threading
 import time
 import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -68,6 +71,28 @@ def open_chromium() -> Iterator[Any]:
         browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-dev-shm-usage"])
         yield browser.new_page(viewport=VIEWPORT)
         browser.close()
+
+
+@contextmanager
+def serve_folder(folder: Path) -> Iterator[str]:
+    """Address of a folder's files on loopback."""
+
+    class Quiet(http.server.SimpleHTTPRequestHandler):
+        def log_message(self, *_: Any) -> None:
+            pass
+
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(folder))) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+
+
+def visit_page(page: Any, address: str) -> None:
+    """Open the page without installation, until it can be asked."""
+    page.goto(address, timeout=PATIENCE_MS)
+    ended = page.locator(".mmgsd-line", has_text=re.compile("Tap in the left|did not work"))
+    ended.wait_for(timeout=3 * PATIENCE_MS)  # its threads share the processors with other tests
+    assert ended.inner_text() == "Tap in the left picture."
 
 
 @contextmanager

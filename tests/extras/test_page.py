@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import http.server
 import io
 import json
-import re
-import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from browser import CHROMIUM, PATIENCE_MS, open_chromium
+from browser import CHROMIUM, PATIENCE_MS, open_chromium, serve_folder, visit_page
 from PIL import Image
 
 import mmgsd
@@ -64,20 +59,6 @@ def whole(matcher: Matcher, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def chromium() -> Iterator[Any]:
     with open_chromium() as page:
         yield page
-
-
-@contextmanager
-def serve(folder: Path) -> Iterator[str]:
-    """Address of a folder's files on loopback."""
-
-    class Quiet(http.server.SimpleHTTPRequestHandler):
-        def log_message(self, *_: Any) -> None:
-            pass
-
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(folder))) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        yield f"http://127.0.0.1:{server.server_port}"
-        server.shutdown()
 
 
 # ---- the folder
@@ -133,7 +114,7 @@ def test_the_mixture_is_the_librarys_on_200_questions(
     xs, ys = (torch.arange(count, dtype=torch.float32) for count in (columns, rows))
     expected = fit_modes(heats, 4, xs, ys, readout=readout, merge=True)
     asked = [heats.flatten(1).double().tolist(), [rows, columns], 4, describe_mixture(readout)]
-    with serve(hollow) as address:
+    with serve_folder(hollow) as address:
         chromium.goto(f"{address}/model.json")
         found = chromium.evaluate(ASK, asked)
     px_a_cell = 485 / columns
@@ -155,7 +136,7 @@ def test_pictures_are_resized_as_the_library_does(
     hollow: Path, chromium: Any, rng: np.random.Generator, size: tuple[int, int]
 ) -> None:
     image = rng.integers(0, 256, (201, 300, 4), dtype=np.uint8)
-    with serve(hollow) as address:
+    with serve_folder(hollow) as address:
         chromium.goto(f"{address}/model.json")
         code = """async ([pixels, from, to]) => {
             const { resize } = await import('./answer.js');
@@ -167,13 +148,6 @@ def test_pictures_are_resized_as_the_library_does(
 
 
 # ---- a visit
-
-
-def visit(page: Any, address: str) -> None:
-    page.goto(address, timeout=PATIENCE_MS)
-    ended = page.locator(".mmgsd-line", has_text=re.compile("Tap in the left|did not work"))
-    ended.wait_for(timeout=3 * PATIENCE_MS)  # its threads share the processors with other tests
-    assert ended.inner_text() == "Tap in the left picture."
 
 
 def tap(page: Any, x: float, y: float, size: tuple[int, int] = (485, 485)) -> np.ndarray:
@@ -209,8 +183,8 @@ def test_a_tap_has_the_librarys_answer_online_and_offline(
     finally:
         matcher.network.reduced_precision = True
     page = chromium.context.browser.new_page(viewport=PHONE)
-    with serve(whole) as address:
-        visit(page, address)
+    with serve_folder(whole) as address:
+        visit_page(page, address)
         assert page.evaluate("() => crossOriginIsolated")
         before = page.locator("canvas").nth(1).screenshot()
         for xy in ((235, 80), (150, 350), (300, 200)):
@@ -240,7 +214,7 @@ def test_a_runtime_that_computes_something_else_is_not_believed(whole: Path, chr
     (tmp_path / "model.json").unlink()
     (tmp_path / "model.json").write_text(json.dumps(model))
     page = chromium.context.browser.new_page()
-    with serve(tmp_path) as address:
+    with serve_folder(tmp_path) as address:
         page.goto(address, timeout=PATIENCE_MS)
         page.get_by_text("it computes other descriptors").wait_for(timeout=PATIENCE_MS)
     page.close()
@@ -250,8 +224,8 @@ def test_a_runtime_that_computes_something_else_is_not_believed(whole: Path, chr
 def test_what_is_no_picture_is_refused_and_a_pasted_one_is_opened(whole: Path, chromium: Any, tmp_path: Path) -> None:
     page = chromium.context.browser.new_page()
     (tmp_path / "photo.heic").write_bytes(b"\0\0\0\x18ftypheic")
-    with serve(whole) as address:
-        visit(page, address)
+    with serve_folder(whole) as address:
+        visit_page(page, address)
         page.locator("input[type=file]").first.set_input_files(tmp_path / "photo.heic")
         page.get_by_text("photo.heic cannot be read").wait_for(timeout=PATIENCE_MS)
         page.evaluate("""async () => {
