@@ -147,7 +147,7 @@ def plot_densities(counts: Mapping[str, Mapping[str, Sequence[int]]]) -> Figure:
             far = max(far, BIN_PX * (1 + float(np.searchsorted(values.cumsum(), SHOWN * values.sum()))))
         axis.set(title=name.capitalize(), xlabel="Error (px)", xlim=(0, far), ylim=(0, None))
     axes[0, 0].set_ylabel("Density per px")
-    axes[0, -1].legend(fontsize=6)
+    axes[0, 0].legend(fontsize=6, loc="upper right")
     return finish_axes(figure)
 
 
