@@ -16,8 +16,8 @@ TORCH_INDEX ?=
 CUDA ?=
 # make figures, paper, data-sample, weights: of which preset.
 PRESET ?= paper
-# make test: in so many processes at once, by default one a core up to four; each computes in one thread.
-JOBS ?= $(shell n=$$(nproc 2>/dev/null || echo 2); echo $$(( n < 4 ? n : 4 )))
+# make test: in so many processes at once, by default one more than cores, four at most; each computes in one thread.
+JOBS ?= $(shell n=$$(nproc 2>/dev/null || echo 2); echo $$(( n < 4 ? n + 1 : 4 )))
 # make lock: the uv program, and a folder that holds torch's CPU wheel.
 UV ?= uv
 FIND_LINKS ?=
