@@ -7,6 +7,7 @@ import json
 import warnings
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -16,7 +17,7 @@ from torch import Tensor, nn
 
 from mmgsd.files import atomic_write
 from mmgsd.match.matcher import Matcher
-from mmgsd.match.places import LIKE
+from mmgsd.match.places import PLACE_TEMPERATURE
 from mmgsd.model.network import compute_input_size
 from mmgsd.numerics import own_numerics
 
@@ -44,8 +45,7 @@ def export_onnx(matcher: Matcher, path: Path | str, *, half: bool = False) -> fl
     The file's metadata hold ``input_size`` ("width height", px, of the training's images), ``multiple_of``,
     ``least_px``, ``quarter_turns`` (averaged in the graph), ``modes``, ``temperature``, for contrastive descriptors
     ``bandwidth``, with heads the layers of ``judge``, which says what is visible, the training's ``config``, and with
-    a ``Matcher.shrinkage`` the ``places`` towards which sources move: ``descriptors``, the ``share``, the temperature
-    ``like``.
+    a ``Matcher.shrinkage`` the ``places`` that sources move towards (`describe_shrinkage`).
 
     What onnxruntime makes of random images of four shapes is compared with torch, both in single precision: returns the
     largest difference, relative to the largest value. On a CPU, where `Matcher.describe` takes bfloat16 for some of its
@@ -69,6 +69,13 @@ def export_onnx(matcher: Matcher, path: Path | str, *, half: bool = False) -> fl
             raise RuntimeError(f"onnxruntime's descriptors differ from torch's by {difference:.1e}: {path} is not "
                                "written")  # fmt: skip
     return difference
+
+
+def describe_shrinkage(matcher: Matcher) -> dict[str, Any] | None:
+    """What `mmgsd.match.places.shrink_sources` needs besides sources, as plain values; None where it does nothing."""
+    if not matcher.shrinkage or matcher.places is None:
+        return None
+    return {"shrinkage": matcher.shrinkage, "temperature": PLACE_TEMPERATURE, "descriptors": matcher.places.tolist()}
 
 
 class _Described(nn.Module):
@@ -121,8 +128,8 @@ def _describe(matcher: Matcher, size: tuple[int, int]) -> dict[str, str]:
     if getattr(matcher.network, "heads", None):
         judge = matcher.network.heads.judge_layers
         values["judge"] = [[layer.weight.tolist(), layer.bias.tolist()] for layer in (judge[0], judge[2])]
-    if matcher.shrinkage and matcher.places is not None:
-        values["places"] = {"share": matcher.shrinkage, "like": LIKE, "descriptors": matcher.places.tolist()}
+    if places := describe_shrinkage(matcher):
+        values["places"] = places
     return {name: str(value) for name, value in numbers.items()} | {n: json.dumps(v) for n, v in values.items()}
 
 

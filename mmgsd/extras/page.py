@@ -23,13 +23,12 @@ import numpy as np
 import onnxruntime
 
 from mmgsd.config import OBJECTS
-from mmgsd.extras.exporting import export_onnx
+from mmgsd.extras.exporting import describe_shrinkage, export_onnx
 from mmgsd.figures.style import HEAT
 from mmgsd.files import check_ours, read_json, replace_folder, scratch_folder, write_json, write_text
 from mmgsd.match import mixture
 from mmgsd.match.match import LIKELY, RADIUS_PX
 from mmgsd.match.matcher import Matcher
-from mmgsd.match.places import LIKE
 from mmgsd.model import heads
 from mmgsd.model.calibration import LEVELS
 from mmgsd.model.network import compute_input_size
@@ -94,8 +93,8 @@ def describe_model(matcher: Matcher, name: str) -> dict[str, Any]:
     if getattr(matcher.network, "heads", None):
         judge = matcher.network.heads.judge_layers
         known["judge"] = [[layer.weight.tolist(), layer.bias.tolist()] for layer in (judge[0], judge[2])]
-    if matcher.shrinkage and matcher.places is not None:
-        known["places"] = {"share": matcher.shrinkage, "like": LIKE, "descriptors": matcher.places.tolist()}
+    if places := describe_shrinkage(matcher):
+        known["places"] = places
     if calibration is not None:
         table = [distance for distance in calibration.radius if math.isfinite(distance)]
         known["calibration"] = {"levels": LEVELS[: len(table)], "table": table, "powers": calibration.powers}

@@ -206,7 +206,7 @@ class Matcher:
         """(1, S, D) what pixels ``xy`` (S, 2) of an image of ``size`` are asked about with.
 
         That is each one's descriptor; of weights with a ``shrinkage`` drawn towards the mean descriptors of the
-        places of the object that it looks like (`mmgsd.match.places.shrink`), unless ``shrink`` is false.
+        places of the object that it looks like (`mmgsd.match.places.shrink_sources`), unless ``shrink`` is false.
         """
         sources = said0.descriptors[None, : self.config.descriptor_dim]
         sampled = sample_descriptors(sources, xy[None].to(self.device).float(), size)

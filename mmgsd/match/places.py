@@ -24,7 +24,7 @@ NAMES = {  # of a place and all that look like it: one of its material points
     "rope": {"ends": 0, "middle": N_POINTS // 2},
 }
 CLOTH_CELL_PX, LINE_PX = 16, 16  # of a flat picture: a cell of a cloth's; the height of any other's
-LIKE = 0.1  # so low a temperature that mostly one place counts
+PLACE_TEMPERATURE = 0.1  # of the heatmap over places, so low that mostly one counts
 GROUND, OBJECT, EDGE = 235, 170, 90  # grey levels
 
 
@@ -89,16 +89,16 @@ class Flat:
         raise ValueError(f"places must be {', '.join(accepted)}, or a list of these, got {place!r:.80}")
 
 
-def shrink_sources(sources: Tensor, places: Tensor, share: float, *, bandwidth: float | None = None) -> Tensor:
-    """Descriptors (…, S, D) moved by a ``share`` of the way to the object's places (P, D) that they are likest to.
+def shrink_sources(sources: Tensor, places: Tensor, shrinkage: float, *, bandwidth: float | None = None) -> Tensor:
+    """Descriptors (…, S, D) moved towards the object's places (P, D) that they are likest to, by a share of the way.
 
     One picture shows a pixel of an object in one way, which the mean over many does not have. Towards one place, or
-    between some that are about as near: to their mean by a heatmap over the places of a temperature of `LIKE`. The
-    share is chosen on renders (`mmgsd.measure.calibration.choose_shrinkage`).
+    between some that are about as near: to their mean by a heatmap over the places at `PLACE_TEMPERATURE`. The
+    ``shrinkage``, 0 to 1, is chosen on renders (`mmgsd.measure.calibration.choose_shrinkage`).
     """
     squared = torch.cdist(sources, places) ** 2
-    like = torch.softmax(-squared / (LIKE * (1 if bandwidth is None else 2 * bandwidth**2)), -1)
-    return torch.lerp(sources, like @ places, share)
+    like = torch.softmax(-squared / (PLACE_TEMPERATURE * (1 if bandwidth is None else 2 * bandwidth**2)), -1)
+    return torch.lerp(sources, like @ places, shrinkage)
 
 
 def lay_flat(descriptors: Tensor, object: str, group: str) -> Flat:

@@ -14,7 +14,7 @@ from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 
 from mmgsd.config import OBJECTS, TrainConfig, load_preset
-from mmgsd.figures.style import COLUMN_IN, finish_axes, styled
+from mmgsd.figures.style import COLUMN_IN, add_legend, finish_axes, styled
 from mmgsd.measure.evaluation import load_queries, read_results, write_results
 from mmgsd.paths import Paths
 from mmgsd.studies.claims import Claim, get, is_better, say
@@ -147,7 +147,7 @@ def plot_densities(counts: Mapping[str, Mapping[str, Sequence[int]]]) -> Figure:
             far = max(far, BIN_PX * (1 + float(np.searchsorted(values.cumsum(), SHOWN * values.sum()))))
         axis.set(title=name.capitalize(), xlabel="Error (px)", xlim=(0, far), ylim=(0, None))
     axes[0, 0].set_ylabel("Density per px")
-    axes[0, 0].legend(fontsize=6, loc="upper right")
+    add_legend(figure, axes[0])
     return finish_axes(figure)
 
 

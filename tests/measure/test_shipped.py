@@ -122,7 +122,7 @@ def test_a_name_may_say_how_modes_are_read(root: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["mine@", "mine@2", "mine@2,x", "mine@1,2,3", "mine@1,2,0,0", "mine@1,2,nan"])
-def test_another_reading_is_two_numbers(root: Path, name: str) -> None:
+def test_another_reading_is_two_numbers_or_three(root: Path, name: str) -> None:
     with pytest.raises(ValueError, match="a reading must be POWER,SHARPNESS"):
         measure_read(name, root, progress=False)
 

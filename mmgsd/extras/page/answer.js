@@ -127,15 +127,15 @@ function normalise(values) {
 // `mmgsd.match.places.shrink_sources`
 function shrinkSource(source, { bandwidth, places }) {
   if (!places) return source;
-  const { descriptors, like, share } = places;
+  const { descriptors, temperature, shrinkage } = places;
   const measure = (place) => place.reduce((total, value, k) => total + (value - source[k]) ** 2, 0);
   const squared = descriptors.map(measure);
   const least = squared.reduce((a, b) => Math.min(a, b));
-  const scale = like * (bandwidth === null ? 1 : 2 * bandwidth ** 2);
+  const scale = temperature * (bandwidth === null ? 1 : 2 * bandwidth ** 2);
   const weights = normalise(squared.map((value) => Math.exp((least - value) / scale)));
   return source.map((value, k) => {
     const mean = weights.reduce((total, weight, place) => total + weight * descriptors[place][k], 0);
-    return value + share * (mean - value);
+    return value + shrinkage * (mean - value);
   });
 }
 
