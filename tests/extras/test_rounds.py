@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import json
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -19,12 +20,13 @@ from mmgsd.measure import calibration
 from mmgsd.model.tensors import read_tensors
 from mmgsd.studies.models import configure_study
 
-TINY = {"steps": 8, "batch": 2, "pairs": 2, "queries": 8, "input_px": 128, "also": ""}
+STEPS = 4
+TINY = {"steps": STEPS, "batch": 2, "pairs": 2, "queries": 8, "input_px": 128, "also": ""}
 
 
-@pytest.fixture
-def root(cloth_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A repository whose rounds are tiny, on synthetic images."""
+@pytest.fixture(scope="module")
+def two_rounds(cloth_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A repository whose rounds are tiny, on synthetic images, after two of the cloth."""
 
     def configure(*arguments: object) -> dict:
         return {name: dataclasses.replace(each, **TINY) for name, each in configure_study(*arguments).items()}
@@ -36,29 +38,39 @@ def root(cloth_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
             (folder / "dataset.json").write_text(json.dumps(info))
         return folder
 
-    monkeypatch.setattr(rounds, "configure_study", configure)
-    monkeypatch.setattr(rounds, "render_dataset", render)
-    monkeypatch.setattr(rounds, "PAIRS", 2)
-    monkeypatch.setattr(matcher, "find_shipped", lambda: tmp_path / "data" / "weights")
-    return tmp_path
+    folder = tmp_path_factory.mktemp("rounds")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rounds, "configure_study", configure)
+        patch.setattr(rounds, "render_dataset", render)
+        patch.setattr(rounds, "PAIRS", 2)
+        patch.setattr(rounds, "VALIDATIONS", STEPS)
+        patch.setattr(matcher, "find_shipped", lambda: folder / "data" / "weights")
+        for number in (1, 2):
+            rounds.run_round(folder, "cloth", number)
+        yield folder
+
+
+@pytest.fixture
+def root(two_rounds: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of it, which `mmgsd rounds` takes for its own."""
+    folder = shutil.copytree(two_rounds, tmp_path / "root")
+    monkeypatch.setattr(rounds, "find_root", lambda: folder)
+    monkeypatch.setattr(matcher, "find_shipped", lambda: folder / "data" / "weights")
+    return folder
 
 
 def test_a_round_goes_on_from_the_one_before(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert rounds.find_round(root, "cloth") == 0
-    first = rounds.run_round(root, "cloth", 1)
-    assert first == root / "data" / "weights" / "cloth-round1.safetensors"
+    first, second = (root / "data" / "weights" / f"cloth-round{number}.safetensors" for number in (1, 2))
     assert first.with_suffix(".md").read_text().startswith("# cloth-round1.safetensors")
-    second = rounds.run_round(root, "cloth", 2)
     assert load(second).config.trunk_weights == "cloth-round1"
-    assert rounds.find_round(root, "cloth") == 2
+    assert [rounds.find_round(root, name) for name in ("cloth", "rope")] == [2, 0]
     stored = json.loads((root / "data" / "results" / "rounds.json").read_text())["cloth"]
     assert list(stored) == ["1", "2"]
-    assert list(stored["2"]["rmse_px"]) == [str(step) for step in range(1, 9)]
+    assert list(stored["2"]["rmse_px"]) == [str(step) for step in range(1, STEPS + 1)]
     assert "before" not in stored["1"]
     assert all(0 < stored["2"][name]["clean"] < 485 for name in ("before", "after"))
     assert stored["2"]["run"]["model"] == load(second).config.name
 
-    monkeypatch.setattr(rounds, "find_root", lambda: root)
     monkeypatch.setattr(rounds, "train_model", lambda *_, **__: pytest.fail("a finished round is trained again"))
     rounds.main("cloth", last=2)
 
@@ -77,10 +89,9 @@ def test_each_round_has_images_of_its_own(number: int) -> None:
 
 
 def test_the_average_of_the_last_rounds_is_shipped_where_it_errs_least(root: Path, monkeypatch, capsys) -> None:
-    monkeypatch.setattr(rounds, "find_root", lambda: root)
-    with pytest.raises(ValueError, match="'cloth' has none"):
-        rounds.main("cloth", ship=True)
-    files = [rounds.run_round(root, "cloth", number) for number in (1, 2)]
+    with pytest.raises(ValueError, match="'rope' has none"):
+        rounds.main("rope", ship=True)
+    files = [root / "data" / "weights" / f"cloth-round{number}.safetensors" for number in (1, 2)]
     errors = {"1": 9.0, "2": 7.0, "cloth-round1": 11.0}
     monkeypatch.setattr(rounds, "_measure_parts", lambda file, _: {"clean": errors[file.stem], "cluttered": 1.0})
     monkeypatch.setattr(calibration, "LEAST_PAIRS", 4)
@@ -100,7 +111,7 @@ def test_the_average_of_the_last_rounds_is_shipped_where_it_errs_least(root: Pat
     one, other, mean = (each["head.source.weight"].float() for each in (first, second, tensors))
     torch.testing.assert_close(mean, (one + other) / 2, atol=1e-4, rtol=0)
     card = shipped.with_suffix(".md").read_text()
-    assert "presets `round1` to `round2` and their cluttered ones" in card and "| 16 steps of" in card
+    assert "presets `round1` to `round2` and their cluttered ones" in card and f"| {2 * STEPS} steps of" in card
     assert "the average of `cloth-round2`, `cloth-round1`" in card and "not measured yet" in card
 
     with pytest.raises(ValueError, match=r"run shipped cloth"):
@@ -118,13 +129,11 @@ def test_the_average_of_the_last_rounds_is_shipped_where_it_errs_least(root: Pat
 
 
 def test_photographs_are_measured_of_the_last_round(root: Path, monkeypatch, capsys) -> None:
-    monkeypatch.setattr(rounds, "find_root", lambda: root)
-    rounds.run_round(root, "cloth", 1)
     shipped = load(find_shipped() / "cloth.safetensors")
     monkeypatch.setattr(rounds, "load", lambda name: shipped if name == "cloth" else load(name))
     monkeypatch.setattr(rounds, "read_photographs", lambda folder, kind: [folder, kind])
     monkeypatch.setattr(rounds, "measure_answers", lambda matcher, asked: {"sharp": matcher.readout.mean_exponent})
     rounds.main("cloth", photographs=Path("mine"))
-    stored = json.loads((root / "data" / "results" / "rounds.json").read_text())["cloth"]["1"]
+    stored = json.loads((root / "data" / "results" / "rounds.json").read_text())["cloth"]["2"]
     printed = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert stored["photographs"] == {"sharp": shipped.readout.mean_exponent} == printed
