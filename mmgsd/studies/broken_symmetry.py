@@ -17,12 +17,13 @@ from mmgsd.measure.evaluation import evaluate_model, load_queries, summarise, wr
 from mmgsd.model.tensors import describe_run
 from mmgsd.paths import Paths
 from mmgsd.scene.stage import render_dataset
-from mmgsd.studies.claims import Claim, fails, get, is_better, list_errors, say
+from mmgsd.studies.claims import Claim, get, is_at_least, list_errors, say
 from mmgsd.studies.models import Model, configure_study, list_rows
 from mmgsd.studies.registry import Results, Shown, Study
 from mmgsd.studies.table import ERRORS, Column, Table
 from mmgsd.symmetry import load_group
 
+SURE = 0.95  # a symmetry is broken where an answer is the right one of all matches so often
 CHOSEN = 0.6  # two matches are told apart where an answer is the right one so often; by chance it is in half
 TOLD, RIGHT_PX = "identity", 1e-3  # the group of one match; two distances that differ by less are one
 
@@ -83,12 +84,15 @@ def describe_fixes(results: Results) -> Table:
 def judge_rotation_limit(results: Results) -> Claim:
     """The first fix of prior work; its errors are not kept by angle, so the cause stays open."""
     free, limited = (get(results, "broken_symmetry", f"cloth, {fix}") for fix in ("any rotation", "±45° only"))
-    share = get(limited, "pck@20px")
+    share, right = get(limited, "pck@20px"), get(limited, "right")
+    suffers = None if right is None else right < SURE
     errors = {"any rotation": get(free, "rmse_mean"), "±45°": get(limited, "rmse_mean")}
     return Claim(
         "rotation-limit", "PCL still suffers where the cloth turns by no more than ±45°.",
-        "Limited, PCL fails by the rule for SIFT, a part; its errors gather at the range's ends, a part not measured.",
-        f"{list_errors(errors)}; limited, {say(share, 'percent')} found within 20 px", (fails(share), None),
+        f"Limited, PCL takes the right one of four matches in fewer than {100 * SURE:.0f} % of its answers, a part; "
+        "its errors gather at the range's ends, a part not measured.",
+        f"{list_errors(errors)}; limited, {say(share, 'percent')} found within 20 px, right {say(right, 'percent')}",
+        (suffers, None),
         runs="broken_symmetry",
     )  # fmt: skip
 
@@ -98,13 +102,11 @@ def judge_ball(results: Results) -> Claim:
     fixes = {"plain": "rope, plain", "with a ball": "rope, ball at one end"}
     rows = {name: get(results, "broken_symmetry", key) for name, key in fixes.items()}
     errors, right = ({name: get(row, key) for name, row in rows.items()} for key in ("rmse_mean", "right"))
-    chosen = None if right["with a ball"] is None else right["with a ball"] >= CHOSEN
     return Claim(
         "ball", "A ball at one end of the rope breaks its symmetry.",
-        "PCL's error is lower with the ball, a part; it takes the right one of the two matches in "
-        f"{100 * CHOSEN:.0f} % of its answers or more, a part.",
+        f"PCL takes the right one of the two matches in {100 * CHOSEN:.0f} % of its answers or more.",
         f"{list_errors(errors)}; right {', '.join(say(share, 'percent') for share in right.values())}",
-        (is_better(errors["with a ball"], errors["plain"]), chosen), runs="broken_symmetry",
+        (is_at_least(right["with a ball"], CHOSEN),), runs="broken_symmetry",
     )  # fmt: skip
 
 

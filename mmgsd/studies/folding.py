@@ -387,7 +387,7 @@ def _say_object(rows: Mapping[str, Any]) -> str:
     counted = truth["reachable"]["success"]["count"] if "reachable" in truth else 0
     said = f"{counted} of {truth['all']['success']['count']} rollouts count"
     sure = get(rows, "mmgsd", "cautious") or {"count": 0}
-    if sure["count"]:
+    if 0 < sure["count"] < counted:  # else caution leaves all of them, or none
         said += f"; MMGSD succeeds in {100 * sure['mean']:.0f} % of the {sure['count']} whose modes agree most"
     return said
 

@@ -57,7 +57,7 @@ def make_results() -> dict:
         for group, errors in inside.items()
     }
     broken = {"cloth, any rotation": 90.0, "cloth, ±45° only": 60.0, "rope, plain": 90.0, "rope, ball at one end": 30.0}
-    small = {"mmgsd": make_errors(40.0), "spcl": make_errors(80.0)}
+    small = {"mmgsd": make_errors(40.0), "mmgsd_plain": make_errors(60.0), "spcl": make_errors(80.0)}
     run = {"steps": 100, "minutes": 1.5, "images": 95, "seed": 0, "hardware": "CPU, 2 cores"}
     limits = {"15": 80.0, "45": 70.0, "90": 50.0, "180": 41.0}  # Unimodal's error
     poses = {limit: {f"{method}-0": {"within": make_errors(e), "any": make_errors(e)}
@@ -77,7 +77,7 @@ def make_results() -> dict:
         "places": {"cloth": {"corner": 20.0, "edge": 25.0, "interior": 35.0}, "rope": {"end": 20.0, "middle": 40.0}},
         "peaks": dict.fromkeys(OBJECTS, 2),
         "seeds_1000": {name: {f"{m}-{k}": make_errors(e + k * s) for k in range(3)
-                              for m, e, s in (("mmgsd", 40.0, 1.0), ("spcl", 60.0, 3.0))} for name in OBJECTS},
+                              for m, e, s in (("mmgsd", 40.0, 1.0), ("spcl_dense", 60.0, 3.0), ("spcl", 60.0, 0.1))} for name in OBJECTS},
         "pose_range": {name: copy.deepcopy(poses) for name in OBJECTS},
         "continuity": {name: {"mmgsd": {"jumps": 0.1}, "spcl": {"jumps": 0.2}} for name in OBJECTS},
         "entropy": {name: {"seen": 9.0, "hidden": 10.0, "straight": 8.0, "overhand knot": 9.0} for name in OBJECTS},
@@ -116,7 +116,7 @@ def test_errors_within_the_margin_are_not_told_apart() -> None:
 
 def test_every_claim_can_hold() -> None:
     verdicts = judge_all(make_results())
-    partly = {"rotation-limit"}  # a part of it is measured by nothing
+    partly = {"rotation-limit", "continuous"}  # a part of them is measured by nothing
     assert verdicts == {key: IN_PART if key in partly else HELD for key in verdicts}
     assert len(verdicts) == sum(len(study.claims) for study in list_studies())
 
@@ -126,7 +126,8 @@ def test_every_claim_can_hold() -> None:
     [
         ("rmse", ("rmse", "cloth", "mmgsd_plain", "rmse_mean"), 36.1, IN_PART),  # whatever dense supervision gives
         ("rmse-dense", ("rmse", "cloth", "mmgsd", "rmse_mean"), 32.5, IN_PART),
-        ("improvement", ("rmse", "rope", "mmgsd_plain", "rmse_mean"), 40.0, IN_PART),  # 33 % there, 42 % on average
+        ("better", ("rmse", "rope", "mmgsd_plain", "rmse_mean"), 58.0, IN_PART),  # within the margin
+        ("improvement", ("rmse", "rope", "mmgsd_plain", "rmse_mean"), 40.0, NOT_HELD),  # 33 % there, 42 % on average
         ("stable", ("seeds_1000", "rope", "mmgsd-2", "rmse_mean"), 90.0, IN_PART),
         ("continuous", ("continuity", "cloth", "spcl", "jumps"), 0.1, IN_PART),
         ("bimodal", ("peaks", "cloth"), 1, IN_PART),
@@ -136,9 +137,8 @@ def test_every_claim_can_hold() -> None:
         ("interior", ("places", "rope", "middle"), 20.0, IN_PART),
         ("interior", ("places", "cloth", "edge"), 36.0, IN_PART),
         ("hand-made", ("rmse", "rope", "orb", "pck@20px"), 0.6, IN_PART),
-        ("rotation-limit", ("broken_symmetry", "cloth, ±45° only", "pck@20px"), 0.6, NOT_HELD),
-        ("ball", ("broken_symmetry", "rope, ball at one end", "rmse_mean"), 88.0, IN_PART),
-        ("ball", ("broken_symmetry", "rope, ball at one end", "right"), 0.5, IN_PART),
+        ("rotation-limit", ("broken_symmetry", "cloth, ±45° only", "right"), 0.96, NOT_HELD),
+        ("ball", ("broken_symmetry", "rope, ball at one end", "right"), 0.5, NOT_HELD),
         ("one-match", ("pose_range", "rope", "45", "unimodal-0", "within", "rmse_mean"), 41.5, IN_PART),
         ("entropy", ("uncertainty", "calibrated", "rope", "mmgsd", "spearman"), 0.29, IN_PART),
         ("inward", ("symmetry", "c4", "regions", "interior", "entropy"), 3.0, NOT_HELD),
@@ -166,11 +166,12 @@ def test_no_claim_holds_where_all_is_otherwise() -> None:
     results["places"] = {"cloth": dict.fromkeys(REGIONS, 30.0), "rope": {"end": 30.0, "middle": 30.0}}
     for metrics in results["broken_symmetry"].values():
         metrics |= {"rmse_mean": 50.0, "pck@20px": 0.9, "right": 0.5}
+    results["broken_symmetry"]["cloth, ±45° only"]["right"] = 1.0
     for row in results["symmetry"].values():
         row |= {"regions": {r: {"rmse_px": 30.0, "entropy": 9.0} for r in REGIONS}, "rings": [3.0, 2.0, 1.0]}
     results["peaks"] = dict.fromkeys(OBJECTS, 1)
     for name in OBJECTS:
-        results["seeds_1000"][name]["spcl-2"] = results["seeds_1000"][name]["spcl-1"]
+        results["seeds_1000"][name]["spcl_dense-2"] = results["seeds_1000"][name]["spcl_dense-1"]
         results["seeds_1000"][name]["mmgsd-2"]["rmse_mean"] = 90.0
         results["continuity"][name]["mmgsd"]["jumps"] = 0.3
         results["pose_range"][name]["15"]["unimodal-0"]["within"]["rmse_mean"] = 40.0
@@ -240,8 +241,8 @@ def test_budget_table_has_the_objects_that_were_trained() -> None:
     results = make_results()
     text = make_table("budget_table", results["budget"])
     assert read_rows(text)["SPCL"][0] == "80.0" and "Cloth" in text and "Rope" not in text and "31.3" not in text
-    improvement = next(claim for claim in list_claims(results) if claim.key == "improvement")
-    assert improvement.measured.endswith("budget: cloth 50 %, rope –; one seed each")
+    better = next(claim for claim in list_claims(results) if claim.key == "better")
+    assert "the same at the studies' budget: cloth 25 %, rope –; " in better.measured  # own loss alone, there as well
 
 
 def test_a_longer_training_is_a_row_that_latex_can_set() -> None:

@@ -140,6 +140,7 @@ def test_each_round_is_a_row_and_its_steps_are_those_so_far() -> None:
 def test_limits_are_in_px_shares_of_the_side_and_milliseconds() -> None:
     lines = to_markdown(describe_limits(ROWS)).splitlines()
     assert "| mean error, clean renders | cloth 21 px, 7 % of its side; rope –, – of its length |" in lines
+    assert "| mean error, cluttered renders | cloth 21 px; rope – |" in lines  # whose side is another
     assert "cloth 17 px where a picture gives –" in lines[5]
     assert "– of a cloth's corners by name, 51 % by another picture" in lines[7]
     assert "140 ms" in lines[8] and "never tried" in lines[9]
