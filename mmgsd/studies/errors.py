@@ -19,11 +19,11 @@ from mmgsd.dataset import Dataset, load_dataset
 from mmgsd.figures import style
 from mmgsd.match.match import Match
 from mmgsd.match.matcher import Matcher
-from mmgsd.measure.evaluation import load_queries, read_results, write_results
+from mmgsd.measure.evaluation import evaluate_model, load_queries, read_results, write_results
 from mmgsd.model.tensors import WEIGHTS
-from mmgsd.paths import Paths
+from mmgsd.paths import Paths, find_shipped
 from mmgsd.studies.claims import NATS, Claim, get, is_above, say
-from mmgsd.studies.models import configure_model, get_colour
+from mmgsd.studies.models import SHIPPED, configure_model, get_colour
 from mmgsd.studies.parameters import check_images, check_made
 from mmgsd.studies.registry import Finding, Results, Shown, Study
 from mmgsd.studies.table import Table, describe_objects
@@ -45,25 +45,34 @@ def list_models(preset: str, method: str, objects: Sequence[str]) -> dict[str, T
 
 
 def check(paths: Paths, *, method: str = "mmgsd", objects: Sequence[str] = OBJECTS, worst: int = 24) -> None:
-    """ValueError where images, models or their answers are missing."""
+    """ValueError where images or models are missing."""
     check_images(paths, objects)
-    models = list_models(paths.preset, method, objects).values()
-    files = [file for m in models for file in (paths.model(m) / WEIGHTS, paths.queries(m.name))]
-    check_made(paths, "03_train and 04_evaluate, or python -m mmgsd run models,", files, method=method)
+    files = [find_model(paths, model) for model in list_models(paths.preset, method, objects).values()]
+    check_made(paths, "03_train, or python -m mmgsd run models,", files, method=method)
+
+
+def find_model(paths: Paths, model: TrainConfig) -> Path:
+    """The weights of a training as it was done here, else as they are shipped; where neither is, the former's path."""
+    trained = paths.model(model) / WEIGHTS
+    shipped = (find_shipped() / f"{model.object}{kind}.safetensors" for kind in SHIPPED.values())
+    same = (file for file in shipped if file.is_file() and Matcher.load(file).config == model)
+    return trained if trained.is_file() else next(same, trained)
 
 
 def run(paths: Paths, *, method: str = "mmgsd", objects: Sequence[str] = OBJECTS, worst: int = 24) -> Path:
     """Join the answers of a method with what the labels know; errors.json, entropy.json, figures of the ``worst``.
 
-    Of another method than MMGSD these files have its name. An object that is left out stays in them.
+    Where the model was not trained here, the same one is asked that is shipped. Of another method than MMGSD these files have its name. An object that is left out stays in them.
     """
     suffix = _get_suffix(method)
     tables, explained, nats = {}, {}, {}
     for name, model in list_models(paths.preset, method, objects).items():
         data = load_dataset(paths.dataset(name), "test")
-        tables[name] = describe_queries(load_queries(paths.queries(model.name)), data)
+        weights, questions = find_model(paths, model), load_preset(paths.preset).evaluate
+        answers = evaluate_model(weights, data.folder, questions, paths.queries(model.name))
+        tables[name] = describe_queries(load_queries(answers), data)
         explained[name], nats[name] = explain_errors(tables[name]), summarise_entropy(tables[name])
-        sheet = plot_worst_queries(tables[name], data, Matcher.load(paths.model(model) / WEIGHTS), count=worst)
+        sheet = plot_worst_queries(tables[name], data, Matcher.load(weights), count=worst)
         style.save_figure(sheet, paths.figures / f"worst_{name}{suffix}", kinds=("jpg",))
     style.save_figure(plot_error_analysis(tables), paths.figures / f"error_analysis{suffix}")
     file, other = (paths.results / f"{name}{suffix}.json" for name in ("errors", "entropy"))

@@ -77,7 +77,8 @@ def make_results() -> dict:
         "places": {"cloth": {"corner": 20.0, "edge": 25.0, "interior": 35.0}, "rope": {"end": 20.0, "middle": 40.0}},
         "peaks": dict.fromkeys(OBJECTS, 2),
         "seeds_1000": {name: {f"{m}-{k}": make_errors(e + k * s) for k in range(3)
-                              for m, e, s in (("mmgsd", 40.0, 1.0), ("spcl_dense", 60.0, 3.0), ("spcl", 60.0, 0.1))} for name in OBJECTS},
+                              for m, e, s in (("mmgsd", 40.0, 1.0), ("spcl_dense", 60.0, 3.0), ("spcl", 60.0, 0.1))}
+                       for name in OBJECTS},
         "pose_range": {name: copy.deepcopy(poses) for name in OBJECTS},
         "continuity": {name: {"mmgsd": {"jumps": 0.1}, "spcl": {"jumps": 0.2}} for name in OBJECTS},
         "entropy": {name: {"seen": 9.0, "hidden": 10.0, "straight": 8.0, "overhand knot": 9.0} for name in OBJECTS},

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,13 +12,28 @@ import pytest
 
 from mmgsd.dataset import Dataset, load_dataset
 from mmgsd.match.match import Match
+from mmgsd.model.tensors import WEIGHTS
+from mmgsd.paths import Paths, find_shipped
 from mmgsd.studies.errors import (
     describe_queries,
+    find_model,
+    list_models,
     plot_error_analysis,
     plot_worst_queries,
     summarise_entropy,
     summarise_states,
 )
+
+
+def test_a_model_that_was_not_trained_here_is_the_shipped_one(tmp_path: Path) -> None:
+    model = list_models("paper", "mmgsd", ["rope"])["rope"]
+    paths = Paths(tmp_path, "paper")
+    assert find_model(paths, model) == find_shipped() / "rope-paper.safetensors"
+    other = dataclasses.replace(model, seed=7)
+    assert find_model(paths, other) == paths.model(other) / WEIGHTS  # there is none
+    (paths.model(model) / WEIGHTS).parent.mkdir(parents=True)
+    (paths.model(model) / WEIGHTS).touch()
+    assert find_model(paths, model) == paths.model(model) / WEIGHTS
 
 
 @pytest.fixture
