@@ -62,7 +62,8 @@ def find_model(paths: Paths, model: TrainConfig) -> Path:
 def run(paths: Paths, *, method: str = "mmgsd", objects: Sequence[str] = OBJECTS, worst: int = 24) -> Path:
     """Join the answers of a method with what the labels know; errors.json, entropy.json, figures of the ``worst``.
 
-    Where the model was not trained here, the same one is asked that is shipped. Of another method than MMGSD these files have its name. An object that is left out stays in them.
+    Where the model was not trained here, the same one is asked that is shipped. Of another method than MMGSD these
+    files have its name. An object that is left out stays in them.
     """
     suffix = _get_suffix(method)
     tables, explained, nats = {}, {}, {}
