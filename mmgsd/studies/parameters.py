@@ -41,6 +41,11 @@ def read_parameters(namespace: MutableMapping[str, Any], **readers: Reader) -> N
     namespace.update({name: reader(name, namespace[name]) for name, reader in readers.items()})
 
 
+def open_paths(preset: str) -> Paths:
+    """Where a preset's files lie in this checkout."""
+    return Paths(find_root(), preset)
+
+
 def check_made(paths: Paths, by: str, files: Iterable[Path], **told: str) -> None:
     """ValueError where one of ``files`` is not there; ``by`` makes it, for the preset and what else is ``told``."""
     same = ", ".join(f"{name}={value!r}" for name, value in {"preset": paths.preset, **told}.items())

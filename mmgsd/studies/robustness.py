@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 
 from matplotlib import pyplot as plt
@@ -23,7 +24,7 @@ from mmgsd.studies.table import Table, describe_errors
 PANELS = (  # a title, what is measured there, and times what
     ("Clean renders", "paper", "rmse_mean", 1.0, "RMSE (px)"),
     ("Cluttered renders", "workspace", "rmse_mean", 1.0, "RMSE (px)"),
-    ("Photographs", "photographs", "found@5%", 100.0, "Corners, ends found (%)"),
+    ("Photographs", "photographs", "found@5%", 100.0, "Found (%), 95 % intervals"),
 )
 COLOURS = {"": get_colour(f"round{ROUNDS['cloth']}"), "paper": get_colour("mmgsd")}
 COLOURS |= {name: get_colour(name) for name in (*BASELINES, *OPTIONAL)}
@@ -55,10 +56,13 @@ def plot_robustness(rows: Rows) -> Figure:
         for place, name in zip(places, names, strict=True):
             found = get_photographs(rows, name) if part == "photographs" else rows[name].get(part, {})
             value, named = found.get(key), found.get("by_name", {}).get(key)
-            _draw_bar(axis, place, name, value and scale * value, named and scale * named)
+            interval = [scale * bound for bound in (found.get("intervals") or {}).get(key, ())]
+            _draw_bar(axis, place, name, value and scale * value, named and scale * named, interval)
+            if value and found.get("unanswered"):
+                axis.texts[-1].set_text(f"{axis.texts[-1].get_text()}; {100 * found['unanswered']:.0f} not answered")
         axis.set(title=title, xlabel=unit)
     widest = 1.12 * max(1.0, *(axis.dataLim.x1 for axis in axes[:2]))
-    for axis, most in zip(axes, (widest, widest, 165), strict=True):  # %, with room for the words
+    for axis, most in zip(axes, (widest, widest, 250), strict=True):  # %, with room for the words
         axis.set_xlim(0, most)
     axes[2].set_xticks([0, 50, 100])
     kinds = [name.partition("@")[0].partition("-") for name in names]
@@ -68,17 +72,21 @@ def plot_robustness(rows: Rows) -> Figure:
     return finish_axes(figure)
 
 
-def _draw_bar(axis: Axes, place: float, name: str, value: float | None, named: float | None = None) -> None:
-    """The bar of a ``value``, dashed up to the one that asking by ``named`` places has."""
+def _draw_bar(
+    axis: Axes, place: float, name: str, value: float | None, named: float | None, interval: Sequence[float]
+) -> None:  # fmt: skip
+    """The bar of a ``value`` with its interval, dashed up to the one that asking by ``named`` places has."""
     if value is None:
         axis.annotate("not measured", (0, place), xytext=(2, 0), textcoords="offset points", va="center", fontsize=5.5)
         return
     colour = COLOURS[name.partition("@")[0].partition("-")[2]]
     axis.barh(place, value, height=0.72, color=colour)
-    text, end = f"{value:.0f}", value
+    if interval:
+        axis.plot(interval, [place] * 2, color="black", linewidth=0.8)
+    text, end = f"{value:.0f}", max([value, *interval])
     if named is not None:
         axis.barh(place, named, height=0.72, fill=False, edgecolor=colour, linestyle="--", linewidth=0.8)
-        text, end = f"{value:.0f}, by name {named:.0f}", max(value, named)
+        text, end = f"{value:.0f}, by name {named:.0f}", max([value, named, *interval])
     axis.annotate(text, (end, place), xytext=(2, 0), textcoords="offset points", va="center", fontsize=6.5)
 
 
