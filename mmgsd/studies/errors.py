@@ -242,7 +242,7 @@ def plot_worst_queries(described: pd.DataFrame, data: Dataset, matcher: Any, *, 
     for axis in axes.flat[len(rows) :]:
         axis.remove()
     signs = {"asked pixel": ("o", style.MARK, "black"), "mode": ("o", "none", style.MODE),
-             "true match": ("x", style.TRUE, style.TRUE)}  # fmt: skip
+             "true match": ("+", style.TRUE, style.TRUE)}  # fmt: skip
     handles = [Line2D([], [], ls="", marker=m, mfc=face, mec=edge, ms=5, label=label)
                for label, (m, face, edge) in signs.items()]  # fmt: skip
     figure.legend(handles=handles, loc="outside lower center", ncols=len(signs), fontsize=6)
