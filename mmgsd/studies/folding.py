@@ -348,7 +348,9 @@ def _list_cells(rows: Mapping[str, Any], name: str) -> list[str]:
     row = rows.get(name, {})
     if "reachable" not in row:
         return [MISSING] * len(HEADS)
-    success = say_share(row["reachable"]["success"])
+    found, counted = (rows.get(key, row)["reachable"]["success"] for key in (name, "truth"))
+    fewer = f" of {found['count']}" if found["count"] != counted["count"] else ""  # it had not all of the rollouts
+    success = say_share(found) + fewer
     same = say_share(estimate_share(list(_list_like_truth(rows, name).values())))
     error = f"{100 * row['reachable']['error']['mean']:.1f} %"
     return [success, same, error, say_beyond(row["beyond"]["error"])]

@@ -46,11 +46,11 @@ POLICIES = {
     for policy in (
         Policy("truth", "true matches", "#404040"),
         Policy("mmgsd", "MMGSD, modes that agree", "#D55E00", "", AGREE),
-        Policy("mmgsd_paper", "MMGSD of clean images alone, modes that agree", "#B22222", "-paper", AGREE),
         Policy("mmgsd_again", "the same, looks again if unsure", "#8A3500", "", AGREE, looks=3),
         Policy("mmgsd_named", "MMGSD, places by name, modes that agree", "#E69F00", "", AGREE, named=True),
         Policy("mmgsd_joint", "MMGSD, surest joint answer", "#F0A070", "", JOINT),
         Policy("mmgsd_best", "MMGSD, each pixel's surest", "#A6761D", "", BEST),
+        Policy("mmgsd_paper", "MMGSD of clean images alone, modes that agree", "#B22222", "-paper", AGREE),
         Policy("spcl", "SPCL, modes that agree", "#0072B2", "-spcl", AGREE),
         Policy("sift", "SIFT, modes that agree", "#CC79A7", "sift", AGREE),
         *(Policy(f"quick_{name}", f"{label}, as `{TRAINED_BY}` trains it", get_colour(name), "", AGREE, name)
