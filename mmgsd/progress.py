@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import sys
 import time
@@ -16,7 +17,14 @@ TOLD = "MMGSD_PROGRESS"  # environment variable that names the file; without it,
 EVERY = 1.0  # s, at least, between two changes of the file
 SAY = 30.0  # s, at least, between two lines of text
 LINE = "{desc}: {n_fmt}/{total_fmt} [{elapsed}<{remaining}, {rate_fmt}{postfix}]"
-NOWHERE = open(os.devnull, "w")  # noqa: SIM115  # where a bar is drawn that nobody would see move
+
+
+class Nowhere(io.TextIOBase):
+    """Where a bar is drawn that nobody would see move."""
+
+    def write(self, text: str) -> int:
+        """Keep nothing."""
+        return len(text)
 
 
 class ProgressBar(tqdm):
@@ -28,7 +36,7 @@ class ProgressBar(tqdm):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self._last, self._said, self._lines = -EVERY, time.monotonic(), not _is_watched()
-        hidden = {"display": False} if issubclass(tqdm, tqdm_notebook) else {"file": NOWHERE}
+        hidden = {"display": False} if issubclass(tqdm, tqdm_notebook) else {"file": Nowhere()}
         super().__init__(*args, **kwargs, **(hidden if self._lines else {}))
 
     def display(self, *args: Any, **kwargs: Any) -> Any:
