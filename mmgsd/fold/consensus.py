@@ -14,6 +14,7 @@ import numpy as np
 RADIUS = 0.08  # of the questions' extent: as near as a mode is to where the motion takes its pixel, where both agree
 ROUNDS = 8  # in which questions take their nearest modes, and the motion is fitted again
 MAX_SCALE = 1.25  # of two questions' distance, by which it may grow or shrink where the scale is known
+MAX_FREE_SCALE = 3.0  # and where it is not: by more, a picture is from elsewhere, or all questions took one place
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,8 +47,9 @@ def find_consensus(
 
     Questions ``asked`` (S, 2) and modes are in one unit; None where no two are at a possible distance.
     Every two questions and their modes propose a motion, with their distance's scale where ``free_scale``; the one
-    whose modes near by weigh most is fitted again to these. NaN modes do not count. ValueError for fewer than two
-    questions, or all at one place.
+    whose modes near by weigh most is fitted again to these, of like ones that with the scale nearest to one: like
+    corners answer for each other, so that a square's fit its own diagonals, or a point. NaN modes do not count.
+    ValueError for fewer than two questions, or all at one place.
     """
     source, target = to_complex(asked), to_complex(modes)  # (S,), (S, n)
     extent = find_extent(asked)
@@ -57,7 +59,8 @@ def find_consensus(
     motions = _propose(source, target, free_scale)  # (M, 2)
     if not len(motions):
         return None
-    scores = [_weigh(motion, source, target, weights, 2 * RADIUS * extent).max(1).sum() for motion in motions]
+    scores = [_weigh(motion, source, target, weights, 2 * RADIUS * extent).max(1).sum() / _stretch(motion) ** 0.5
+              for motion in motions]  # fmt: skip
     motion = motions[int(np.argmax(scores))]
     for _ in range(3):
         near = _weigh(motion, source, target, weights, 2 * RADIUS * extent)
@@ -75,14 +78,19 @@ def _propose(source: np.ndarray, target: np.ndarray, free_scale: bool) -> np.nda
         factor = (target[j][None] - target[i][:, None]) / (source[j] - source[i])  # (n, n)
         scale = np.abs(factor)
         with np.errstate(invalid="ignore", divide="ignore"):
-            allowed = np.isfinite(factor) & (scale > 0)
-            if not free_scale:
-                allowed &= (scale < MAX_SCALE) & (scale > 1 / MAX_SCALE)
-                factor = factor / scale
+            most = MAX_FREE_SCALE if free_scale else MAX_SCALE
+            allowed = np.isfinite(factor) & (scale < most) & (scale > 1 / most)
+            factor = factor if free_scale else factor / scale
         middle = (target[i][:, None] + target[j][None]) / 2
         shift = middle - factor * (source[i] + source[j]) / 2
         found.append(np.stack([factor[allowed], shift[allowed]], 1))
     return np.concatenate(found) if found else np.zeros((0, 2), complex)
+
+
+def _stretch(motion: np.ndarray) -> float:
+    """By how much a motion changes lengths, either way; 1 of one that keeps them."""
+    scale = abs(motion[0])
+    return max(scale, 1 / scale)
 
 
 def _weigh(motion: np.ndarray, source: np.ndarray, target: np.ndarray, weights: np.ndarray, reach: float) -> np.ndarray:

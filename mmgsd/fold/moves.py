@@ -10,6 +10,7 @@ import numpy as np
 
 from mmgsd.checks import check_choice, read_flag
 from mmgsd.fold.consensus import (
+    MAX_FREE_SCALE,
     RADIUS,
     Motion,
     assign_grasps,
@@ -97,7 +98,8 @@ def answer_picture(
     The picture is taken from about where the demonstration's was: a turn, a shift and a scale lead from one to the
     other; ``chosen`` is as `choose_moves` has it. ``by_name`` the look's places are looked for instead of its pixels.
     ValueError for a look that there is not, or that names no places, weights of another object, a picture that does not
-    show the object, a pick off the object, and where fewer than `LEAST` of the look's picks and anchors agree.
+    show the object, a pick off the object, picks that are answered by one place, and where fewer than `LEAST` of the
+    look's picks and anchors agree.
     """
     count = len(demonstration.looks)
     if look not in range(count):
@@ -113,7 +115,13 @@ def answer_picture(
         raise ValueError(f"picks and anchors must be on the object of the demonstration, these are not: {off}")
     if match.absent is not None and match.absent[0] > 0.5:
         raise ValueError(f"the picture must show a {demonstration.object}, none is seen in it")
-    answer = choose_moves(shown, match, chosen, np.asarray, np.asarray, free_scale=True)
+    zoom = max(image.shape[:2]) / max(shown.image.shape[:2])  # a picture of more pixels is none from nearer by
+    answer = choose_moves(shown, match, chosen, lambda xy: zoom * xy, np.asarray, free_scale=True)
+    before, after = zoom * find_extent(shown.moves[:, 0]), find_extent(answer.moves[:, 0])
+    if after * MAX_FREE_SCALE < before:
+        raise ValueError("the picture's answers to the picks must lie apart as these do, chosen by "
+                         f"{chosen!r} they are at one place, {answer.moves[0, 0].round().tolist()}: "
+                         f"choose {JOINT!r}")  # fmt: skip
     if answer.share < LEAST:
         raise ValueError(f"the picture's answers must agree with the demonstration, {answer.share:.0%} of them do: "
                          "take it from where the demonstration was taken, or add anchors")  # fmt: skip

@@ -50,10 +50,18 @@ def test_wrong_and_absent_modes_are_outvoted(rng: np.random.Generator) -> None:
 
 
 def test_the_scale_is_free_where_no_camera_tells_it(rng: np.random.Generator) -> None:
-    modes, weights = answer(rng, motion=Motion(300 * TRUTH.factor, 250 + 240j))
-    assert find_consensus(ASKED, modes, weights) is None
+    modes, weights = answer(rng, motion=Motion(1.7 * TRUTH.factor, 0.5 + 0.4j))
+    assert find_consensus(ASKED, modes, weights)[1] < 1
     motion, share = find_consensus(ASKED, modes, weights, free_scale=True)
-    assert abs(motion.factor) == pytest.approx(300, rel=1e-6) and share == 1
+    assert abs(motion.factor) == pytest.approx(1.7, rel=1e-6) and share == 1
+
+
+@pytest.mark.parametrize("count", [2, 3, 4])
+def test_like_corners_are_neither_one_place_nor_a_diagonal(count: int) -> None:
+    corners = Motion(0.9 * np.exp(0.4j), 0.1 + 0j).apply(ASKED[:4])
+    modes = np.tile(corners, (count, 1, 1))  # each is asked for a corner, and any corner is as good an answer
+    motion, share = find_consensus(ASKED[:count], modes, np.full((count, 4), 0.25), free_scale=True)
+    assert abs(motion.factor) == pytest.approx(0.9, rel=1e-6) and share == 1
 
 
 def test_nothing_agrees_with_no_modes() -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import mmgsd
 from mmgsd.__main__ import main
@@ -104,6 +105,20 @@ def test_what_cannot_be_answered_is_said(data, written, capsys, tmp_path) -> Non
     assert "'cloth', got weights of 'rope'" in fail(capsys, str(written), image, "--weights", "rope")
     assert "--intrinsics" in fail(capsys, str(written), image, "--weights", "cloth", "--intrinsics", "9,9,9")
     assert "nowhere.json" in fail(capsys, str(tmp_path / "nowhere.json"), image, "--weights", "cloth")
+
+
+def test_corners_alone_are_picked_apart_and_no_pick_takes_anothers_place(data) -> None:
+    matcher, xy = mmgsd.load("cloth"), data.xy[DEMO].astype(float)
+    corners = xy[[0, 24, 624, 600]]  # all of them alike
+    look = Look(data.load_image(DEMO), np.stack([corners[:2], corners[[3, 2]]], 1), corners[2:])
+    demonstration, side = Demonstration("cloth", (look,)), np.linalg.norm(corners[1] - corners[0])
+    large = np.asarray(Image.fromarray(data.load_image(NOW)).resize((2000, 2000)))
+    for image, factor in ((data.load_image(DEMO), 1.0), (data.load_image(NOW), 1.0), (large, 2000 / 485)):
+        picks = answer_picture(matcher, demonstration, image).moves[:, 0] / factor
+        assert 0.6 * side < np.linalg.norm(picks[1] - picks[0]) < 1.2 * side
+    with pytest.raises(ValueError, match="'best' they are at one place, .* choose 'joint'"):
+        for image in map(data.load_image, range(len(data))):  # the surest corner, each time
+            answer_picture(matcher, demonstration, image, chosen=BEST)
 
 
 def test_an_empty_table_and_a_pick_beside_the_cloth_are_no_answers(data, demonstration) -> None:
