@@ -10,8 +10,11 @@ import argparse
 import codecs
 import inspect
 import os
+import signal
 import sys
+import threading
 import typing
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -69,9 +72,13 @@ def run_command(main: Callable[[], None], *, kept: str = KEPT) -> None:
     """Run a command line's ``main``, and let each error be one sentence on stderr.
 
     Exits with 2 for what was given and does not do, with 1 for what went wrong otherwise, such as a full disk, and with
-    130 after Ctrl-C, when it says what is ``kept``. MMGSD_TRACEBACK=1 in the environment lets the traceback through.
+    130 after Ctrl-C or SIGTERM, when it says what is ``kept``. MMGSD_TRACEBACK=1 in the environment lets the traceback
+    through.
     """
     _print_anywhere()
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, signal.default_int_handler)  # `timeout` and systemd stop a run as Ctrl-C does
+    warnings.formatwarning = lambda message, *_, **__: f"warning: {message}\n"  # not where in which file
     if os.environ.get("MMGSD_TRACEBACK", "0") not in ("", "0"):
         main()
         return

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import re
+import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -75,27 +76,46 @@ def _read_video(path: Path) -> Iterator[np.ndarray]:
 def _opening(path: Path) -> Iterator[cv2.VideoCapture]:
     """What FFmpeg makes of a file; its own words are kept back, a sentence of ours says what is wrong."""
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    level = cv2.setLogLevel(0)
-    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-    cv2.setLogLevel(level)
-    yield capture
-    capture.release()
+    logging = cv2 if hasattr(cv2, "setLogLevel") else cv2.utils.logging  # before OpenCV 4.13, and from it on
+    level = logging.setLogLevel(0)
+    with _spelling(path) as plain:
+        capture = cv2.VideoCapture(str(plain), cv2.CAP_FFMPEG)
+        logging.setLogLevel(level)
+        yield capture
+        capture.release()
+
+
+@contextmanager
+def _spelling(path: Path) -> Iterator[Path]:
+    """A path that OpenCV can be given: a link to one whose name is no UTF-8, which would end the process."""
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        with tempfile.TemporaryDirectory() as place:
+            link = Path(place, "video").with_suffix(path.suffix.encode("ascii", "ignore").decode())
+            link.symlink_to(path.absolute())
+            yield link
+    else:
+        yield path
 
 
 @contextmanager
 def writing_video(path: Path, rate: float) -> Iterator[Callable[[np.ndarray], None]]:
     """Give what takes frames (H, W, 3) uint8 RGB of one size, ``rate`` a second; the file appears whole or not at all.
 
-    ValueError where its name does not end as `CODECS` do, RuntimeError where this OpenCV cannot write such a file.
+    ValueError where its name does not end as `CODECS` do, RuntimeError where this OpenCV cannot write such a file,
+    OSError where it lacks frames, as on a full disk, which FFmpeg tells nobody.
     """
     check_choice("ending of a video that is written", path.suffix.lower(), tuple(CODECS))
     path.parent.mkdir(parents=True, exist_ok=True)
-    with scratch_folder(path.parent, path.name) as folder:
-        inside, writer = folder / f"video{path.suffix.lower()}", cv2.VideoWriter()
+    with scratch_folder(path.parent, path.name) as scratch, _spelling(scratch) as folder:
+        inside, writer, count = folder / f"video{path.suffix.lower()}", cv2.VideoWriter(), 0
         kind = cv2.VideoWriter_fourcc(*CODECS[inside.suffix])
 
         def write(frame: np.ndarray) -> None:
             """Add a frame; the first one opens the file."""
+            nonlocal count
+            count += 1
             if not (writer.isOpened() or writer.open(str(inside), cv2.CAP_FFMPEG, kind, rate, frame.shape[1::-1])):
                 raise RuntimeError(f"this OpenCV cannot write {path.suffix} videos: choose another of {[*CODECS]}")
             writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
@@ -105,5 +125,9 @@ def writing_video(path: Path, rate: float) -> Iterator[Callable[[np.ndarray], No
         finally:
             writer.release()
         if inside.exists():
+            with _opening(inside) as capture:
+                written = sum(1 for _ in iter(capture.grab, False))
+            if written < count:
+                raise OSError(f"{path} holds {written} of {count} frames that were written: is there room on its disk?")
             with atomic_write(path) as aside:
                 os.replace(inside, aside)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -140,3 +141,14 @@ def test_a_functions_parameters_are_arguments_and_options(capsys):
         with pytest.raises(SystemExit):
             parser.parse_args(wrong)
         assert said in capsys.readouterr().err
+
+
+@pytest.mark.skipif(os.name != "posix", reason="another system ends a process otherwise")
+def test_sigterm_is_as_ctrl_c(capsys: pytest.CaptureFixture) -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    try:
+        with pytest.raises(SystemExit) as stopped:
+            run_command(lambda: os.kill(os.getpid(), signal.SIGTERM), kept="all is kept")
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert stopped.value.code == 130 and "all is kept" in capsys.readouterr().err

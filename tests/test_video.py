@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
+from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -29,6 +32,38 @@ def test_what_is_written_is_read_again(tmp_path: Path, ending: str) -> None:
     for frame, expected in zip(video, make_frames(), strict=True):
         assert np.abs(frame.astype(int) - expected).mean() < 6
     assert len(list(video)) == 5  # once more from the first one on
+
+
+@pytest.mark.skipif(os.name != "posix", reason="names of bytes are POSIX's")
+def test_a_name_that_is_no_utf8_is_written_and_read(tmp_path: Path) -> None:
+    path = tmp_path / os.fsdecode(b"caf\xe9") / os.fsdecode(b"na\xefve.mp4")
+    with writing_video(path, 10) as write:
+        for frame in make_frames():
+            write(frame)
+    assert len(list(open_video(path))) == 5 and list(path.parent.iterdir()) == [path]
+
+
+def test_a_video_that_lost_frames_takes_no_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class FullDisk(cv2.VideoWriter):
+        def write(self, frame: np.ndarray) -> None:
+            """Lose it, as FFmpeg does without a word."""
+
+    path = tmp_path / "a.mp4"
+    path.write_bytes(b"what was there")
+    monkeypatch.setattr(cv2, "VideoWriter", FullDisk)
+    with pytest.raises(OSError, match="a.mp4 holds 0 of 5 frames"), writing_video(path, 10) as write:
+        for frame in make_frames():
+            write(frame)
+    assert path.read_bytes() == b"what was there" and list(tmp_path.iterdir()) == [path]
+
+
+def test_videos_are_read_where_opencv_moved_its_log_level(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with writing_video(tmp_path / "a.avi", 10) as write:
+        write(make_frames()[0])
+    moved = SimpleNamespace(setLogLevel=lambda level: level)
+    monkeypatch.delattr(cv2, "setLogLevel", raising=False)  # 4.13 and later
+    monkeypatch.setattr(cv2.utils, "logging", moved, raising=False)
+    assert len(list(open_video(tmp_path / "a.avi"))) == 1
 
 
 def test_what_fails_while_it_is_written_leaves_nothing(tmp_path: Path) -> None:

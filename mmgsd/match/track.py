@@ -11,6 +11,7 @@ frame optical flow is exacter than any match: it carries the points, and the mat
 from __future__ import annotations
 
 import os
+import warnings
 from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -81,8 +82,9 @@ class Tracker:
 
     The first frame need not be ``image0``, nor show the object. Of places, each and all that look like it are followed:
     S counts them together, a place's own beside each other, in the order of the first frame that shows them. Memory
-    does not grow. ValueError for pixels outside image0, an image0 that does not show the object, weights that know
-    neither where it lies (``mask0`` (H, W) bool says it) nor, of places, what they look like.
+    does not grow. A warning names pixels that show background more likely, which count as hidden. ValueError for pixels
+    outside image0, an image0 that does not show the object, weights that know neither where it lies (``mask0`` (H, W)
+    bool says it) nor, of places, what they look like.
     """
 
     def __init__(
@@ -96,6 +98,7 @@ class Tracker:
         self._counts: np.ndarray | None = None  # of places: how many like ones each has, (S,)
         self._columns: list[np.ndarray] = []  # and which members' maps show these
         self._motion: _Motion | None = None
+        self._on_object: np.ndarray | None = None  # (S,) of pixels
         if places is None:
             pair = matcher.prepare(image0, image0, mask0=mask0, mask1=mask0)
             self._image0, self._said0, self._mask0 = pair.image0, pair.outputs[0], pair.mask0
@@ -111,6 +114,10 @@ class Tracker:
         match, order = pair.match_everywhere(self._points)
         if match.absent is not None and match.absent[0] > LIKELY or len(match) == len(self._points):
             raise ValueError("image0 must show the object, none is seen in it: begin with another frame, or give mask0")
+        if match.on_object is not None:
+            self._on_object = match.on_object[: len(self._points)]
+            if (off := self._on_object < LIKELY).any():
+                warnings.warn(f"these pixels are more likely background: {self._points[off].tolist()}", stacklevel=4)
         lain = np.full((*order.shape, 2), np.nan)
         lain[:, 0] = match.xy  # the member that leaves all as it is
         self._remember(lain, _start(order.shape[1]))
@@ -177,6 +184,8 @@ class Tracker:
         places, chosen = self._motion.update(match.image1, modes.astype(float), spread[..., 0])
         taken = np.arange(len(rows)), np.take_along_axis(order, chosen[:, None], 1)[:, 0]
         visible = np.full(len(rows), np.nan) if match.visible is None else match.visible[taken]
+        if self._on_object is not None:
+            visible = np.where(self._on_object < LIKELY, np.minimum(visible, self._on_object), visible)
         return Tracked(places, visible, match.confidence()[taken] * sure, absent)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 from types import SimpleNamespace
 
@@ -191,3 +192,12 @@ def test_a_turning_cloth_s_points_stay_themselves_with_the_shipped_weights() -> 
     ours = measure_track(found.xy, found.visible > 0.5, truth)
     flow = measure_track(*METHODS["dis"].follow("cloth", video.frames, video.xy[0, points]), truth)
     assert ours["swaps"] <= 0.02 and ours["delta"] > max(0.45, flow["delta"])
+
+
+def test_a_pixel_beside_the_object_is_named_and_hidden(follow, rng: np.random.Generator) -> None:
+    match, order = answer(0, rng)
+    seen = np.ones(len(match))
+    seen[1] = 0.02
+    with pytest.warns(UserWarning, match=r"more likely background: \[\[150.0, 60.0\]\]"):
+        found = follow([(dataclasses.replace(match, on_object=seen), order)])
+    assert found.visible[0].tolist() == pytest.approx([0.9, 0.02, 0.9])
