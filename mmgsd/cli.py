@@ -6,7 +6,7 @@ import argparse
 import itertools
 import re
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from csv import DictWriter
 from json import dumps
@@ -169,7 +169,7 @@ def find(
     answer = answer.seen_first() if seen_first else answer
     described = [{"place": place, **query} for place, query in zip(places, describe_answer(answer), strict=True)]
     if out:
-        draw_answer(answer, out)
+        draw_answer(answer, out, [*map(_name_place, places)])
     lines = (f"{_name_place(query['place'])} -> {format_query(query).partition(' -> ')[2]}" for query in described)
     print(dumps(described) if json else "\n".join(lines), flush=True)
 
@@ -384,11 +384,11 @@ def samples(object: Annotated[str, Option(choices=OBJECTS)] = "cloth") -> None:
     print(*mmgsd.find_samples(object), sep="\n")
 
 
-def draw_answer(answer: Any, path: Path) -> None:
-    """One query as two large panels, several as a page."""
+def draw_answer(answer: Any, path: Path, names: Sequence[str] = ()) -> None:
+    """One query as two large panels, several as a page, those for places with their ``names``."""
     from mmgsd.figures.plots import plot_page
 
-    save_picture(answer.plot() if len(answer) == 1 else plot_page(answer), path)
+    save_picture(answer.plot() if len(answer) == 1 else plot_page(answer, names), path)
 
 
 def save_picture(figure: Any, path: Path) -> None:

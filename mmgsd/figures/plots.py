@@ -37,7 +37,8 @@ def plot_match(match: Match, index: int = 0) -> Figure:
     whole = isinstance(index, int | np.integer) and not isinstance(index, bool)
     if not whole or not 0 <= index < len(match):
         raise ValueError(f"index must be in [0, {len(match)}), got {index!r}")
-    figure, axes = style.make_grid([match.image0.shape[0] / match.image0.shape[1]], 2, style.PAGE_IN * 0.7)
+    aspect = max(image.shape[0] / image.shape[1] for image in (match.image0, match.image1))
+    figure, axes = style.make_grid([aspect], 2, style.PAGE_IN * 0.7)
     style.show_source(axes[0, 0], match, index)
     style.show_answer(axes[0, 1], match, index)
     axes[0, 0].set_title("Source")
@@ -46,8 +47,10 @@ def plot_match(match: Match, index: int = 0) -> Figure:
 
 
 @style.styled
-def plot_page(match: Match) -> Figure:
+def plot_page(match: Match, names: Sequence[str] = ()) -> Figure:
     """All queries, two beside each other: the source's pixel, the answer, and above them number, pixel and entropy.
+
+    ``names`` of places that were asked for stand instead of number and pixel.
 
     ValueError for none, or for more than `PAGE_QUERIES`.
     """
@@ -63,7 +66,7 @@ def plot_page(match: Match) -> Figure:
         style.show_source(source, small, index)
         style.show_answer(answer, small, index)
         x, y = match.xy[index]
-        source.set_title(f"{index + 1} · pixel {x:g}, {y:g}")
+        source.set_title(names[index] if names else f"{index + 1} · pixel {x:g}, {y:g}")
         said = match.say_presence(index).partition(":")[0]  # a panel has room for a word
         answer.set_title(said or f"entropy {match.entropy[index]:.1f} nats")
     return figure

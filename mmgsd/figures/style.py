@@ -32,6 +32,7 @@ MODE = "#00E0FF"  # that of modes
 HEAT = colormaps["inferno"](np.linspace(0.3, 1, 256))[:, :3].astype(np.float32)  # from cold to hot
 FAINT = 0.35  # opacity of modes where there is no answer
 OPAQUE = 0.05  # weight from which on a mode is drawn in full; with less it fades, and with none it is not seen
+LOWEST = 0.75  # height of a panel, at least, by its width
 FADED = 0.75  # brightness of an image under a heatmap
 
 _SANS = ["DejaVu Sans"]  # comes with matplotlib: the same letters everywhere
@@ -71,6 +72,9 @@ def compute_point_colours(object: str, count: int) -> np.ndarray:
 def show_source(axis: Axes, match: Match, index: int) -> None:
     """Source image with the pixel of one query."""
     axis.imshow(match.image0)
+    height, width = match.image0.shape[:2]
+    if height < LOWEST * width:  # a rope laid flat
+        axis.set_ylim(height / 2 + LOWEST * width / 2, height / 2 - LOWEST * width / 2)
     axis.autoscale(False)
     mark_pixel(axis, *match.xy[index])
 

@@ -181,3 +181,14 @@ def test_no_figure_stays_open():
     before = pyplot.get_fignums()  # of other tests
     plots.plot_samples([np.zeros((4, 4, 3), np.uint8)])
     assert pyplot.get_fignums() == before
+
+
+def test_a_rope_laid_flat_takes_as_much_room_as_its_answer():
+    match = dataclasses.replace(make_match(2), image0=np.zeros((16, 625, 3), np.uint8))
+    for figure in (plots.plot_match(match), plots.plot_page(match, ["ends", "middle"])):
+        low, high = figure.axes[0].get_ylim()
+        assert low - high == pytest.approx(0.75 * 625)
+        figure.canvas.draw()
+        first, second = (axis.get_window_extent() for axis in figure.axes[:2])
+        assert second.height > 0.6 * first.height
+    assert [axis.get_title() for axis in figure.axes[::2]] == ["ends", "middle"]
