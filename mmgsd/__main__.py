@@ -89,6 +89,7 @@ def make_parser(words: list[str]) -> argparse.ArgumentParser:
     """The commands, of which the one that ``words`` begin with has its arguments: no other is imported."""
     prog = "python -m mmgsd" if Path(sys.argv[0]).name == "__main__.py" else "mmgsd"
     parser = argparse.ArgumentParser(prog=prog, description=mmgsd.__doc__.partition("\n")[0])
+    parser.add_argument("--version", action="version", version=f"mmgsd {mmgsd.__version__}")
     commands = parser.add_subparsers(dest="_command", required=True, metavar="command")
     _add_commands(commands, COMMANDS, words)
     studies = _list_studies() if words[:1] == ["run"] else {}

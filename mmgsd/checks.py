@@ -64,8 +64,8 @@ def renamed(old: str, new: str) -> property:
     """An attribute under its former name ``old``, which warns and gives that of the ``new`` one."""
 
     def get(self: object) -> Any:
-        """The value under its present name."""
         warnings.warn(f"{type(self).__name__}.{old} is called {new} now", DeprecationWarning, stacklevel=2)
         return getattr(self, new)
 
-    return property(get)
+    get.renamed = new
+    return property(get, doc=f"Deprecated: `{new}` is its present name.")

@@ -374,9 +374,10 @@ def heads(
     """Measure the masks, hidden matches and absence that weights tell beside their matches, and store it."""
     from mmgsd.config import EvaluateConfig
     from mmgsd.files import read_json
+    from mmgsd.match.matcher import find_weights
     from mmgsd.measure.heads import evaluate_heads
 
-    print(dumps(read_json(evaluate_heads(weights, data, EvaluateConfig(pairs=100), out))))
+    print(dumps(read_json(evaluate_heads(find_weights(weights), data, EvaluateConfig(pairs=100), out))))
 
 
 def samples(object: Annotated[str, Option(choices=OBJECTS)] = "cloth") -> None:

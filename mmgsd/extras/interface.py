@@ -54,7 +54,7 @@ def _list_entries(place: str) -> Iterator[tuple[str, str, str]]:
     yield name, name + _sign(thing), _to_markdown(thing)
     for member, value in vars(thing).items() if inspect.isclass(thing) else ():
         value = getattr(value, "__func__", getattr(value, "fget", getattr(value, "func", value)))  # of a property
-        if inspect.isfunction(value) and not member.startswith("_"):
+        if inspect.isfunction(value) and not member.startswith("_") and not hasattr(value, "renamed"):
             called = _sign(value) if callable(getattr(thing, member)) else ""
             yield f"{name}.{member}", f"{name}.{member}{called}", _to_markdown(value)
 

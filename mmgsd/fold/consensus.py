@@ -54,7 +54,7 @@ def find_consensus(
     source, target = to_complex(asked), to_complex(modes)  # (S,), (S, n)
     extent = find_extent(asked)
     if len(source) < 2 or not extent > 0:
-        raise ValueError(f"asked must be at least two places, got {np.asarray(asked).tolist()}")
+        raise ValueError(f"picks and anchors must be at two places or more, got {np.asarray(asked).tolist()}")
     weights = np.where(np.isfinite(target), weights, 0.0)
     motions = _propose(source, target, free_scale)  # (M, 2)
     if not len(motions):

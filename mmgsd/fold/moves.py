@@ -85,7 +85,7 @@ def match_look(matcher: Matcher, look: Look, image: np.ndarray, *, by_name: bool
     if not by_name:
         return matcher.match(look.image, image, look.asked, **how)
     if not look.places:
-        raise ValueError("by_name must be False: the demonstration's look names no places")
+        raise ValueError("places must be named in the demonstration's look where it is asked by_name")
     return matcher.find(image, list(look.places), **how)
 
 

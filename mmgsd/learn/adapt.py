@@ -70,7 +70,8 @@ CARD = """# {name}
 """
 MEASURED = """\
 Photographs: means and 95 % intervals, of each marked photograph by weights that had not learnt from it: they were left
-out in {folds} parts by turns. The weights here learnt from all of them."""
+out in {folds} parts by turns, and the number of steps was chosen by the other parts: where these choose none, nothing
+changes. The weights here learnt from all of them, by as many steps as all parts together choose."""
 NOT_MEASURED = "What it does in photographs is not measured: no marked ones were left out, of which it takes two."
 UNCHANGED = "None of the numbers of steps found more in photographs left out: the weights are as they were."
 LABELS = {"picture": "asked by another picture", "name": "by name"}

@@ -101,6 +101,7 @@ class Matcher:
     @own_numerics(gradients=True)
     def load(cls, path: Path | str, *, device: str = "") -> Matcher:
         """Weights from a safetensors file; FileNotFoundError, or ValueError for one that is damaged or not ours."""
+        find_device(device)  # what is wrong with it is not the file's fault
         network, config, settings, object = read_weights(path)
         try:
             matcher = cls(network, config, device=device, **settings)
@@ -273,8 +274,8 @@ class Matcher:
     def lay_flat(self) -> Flat:
         """The object laid flat, as its places are asked for; ValueError of weights that do not know them."""
         if self.places is None:
-            raise ValueError(f"these weights of {self.config.name} do not know the object's places, so image0 must be "
-                             "given: python -m mmgsd calibrate adds them")  # fmt: skip
+            raise ValueError(f"these weights of {self.config.name} do not know the object's places: give a first "
+                             "image instead, or add them by python -m mmgsd calibrate")  # fmt: skip
         return lay_flat(self.places.to(self.device), self.object, self.config.group)
 
     def look_up_places(self, places: Any, *, joint: bool) -> tuple[Flat, np.ndarray, np.ndarray | None]:
@@ -406,8 +407,8 @@ class Pair:
         if self.mask0 is not None:
             return self.mask0
         if self.outputs[0].mask is None:
-            raise ValueError("joint must be False, or mask0 be given: these weights of "
-                             f"{self.matcher.config.name} learnt no mask")  # fmt: skip
+            raise ValueError(f"mask0 must be given for joint answers and tracks: these weights of "
+                             f"{self.matcher.config.name} do not know where the object lies")  # fmt: skip
         return self.matcher.resize_mask(self.outputs[0].mask, self.image0.shape[1::-1]) >= 0.5
 
     def _match(self, points: np.ndarray, n: Any, *, merge: bool = True) -> Match:

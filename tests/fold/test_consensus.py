@@ -70,7 +70,7 @@ def test_nothing_agrees_with_no_modes() -> None:
 
 @pytest.mark.parametrize("asked", [ASKED[:1], ASKED[[0, 0]], ASKED[:0]])
 def test_one_place_tells_no_motion(asked: np.ndarray) -> None:
-    with pytest.raises(ValueError, match="asked must"):
+    with pytest.raises(ValueError, match="picks and anchors must"):
         find_consensus(asked, np.zeros((len(asked), 4, 2)), np.ones((len(asked), 4)))
 
 

@@ -67,7 +67,7 @@ def test_the_surest_modes_of_a_picture_are_those_of_each_pixel(data, demonstrati
 def test_places_by_name_need_no_look_at_the_demonstrations_picture(data, demonstration, written, capsys) -> None:
     matcher, image, look = mmgsd.load("cloth"), data.load_image(NOW), demonstration.looks[0]
     blank = dataclasses.replace(look, image=np.zeros_like(look.image), places=(*CORNERS, *INSIDE))
-    with pytest.raises(ValueError, match="by_name must be False"):
+    with pytest.raises(ValueError, match="places must be named"):
         answer_picture(matcher, demonstration, image, by_name=True)
     with pytest.raises(ValueError, match="do not know the object's places"):
         answer_picture(mmgsd.load("cloth-paper"), Demonstration("cloth", (blank,)), image, by_name=True)
@@ -75,7 +75,7 @@ def test_places_by_name_need_no_look_at_the_demonstrations_picture(data, demonst
     assert answer.share == 1 and find_error(data, answer.moves[:, 0]) < 15
     with pytest.raises(SystemExit) as stopped:
         main(["fold", str(written), str(SAMPLE / data.labels.file[NOW]), "--weights", "cloth", "--by-name"])
-    assert stopped.value.code == 2 and "by_name must be False" in capsys.readouterr().err
+    assert stopped.value.code == 2 and "places must be named" in capsys.readouterr().err
 
 
 def test_the_command_prints_pixels_and_rays(data, written, capsys) -> None:

@@ -190,7 +190,7 @@ def test_weights_without_a_mask_ask_for_the_users() -> None:
     network, config = build_network("lite0", 8, pretrained=False), TrainConfig(input_px=64, descriptor_dim=8)
     matcher = Matcher(network, config, modes=4, size=(260, 260), device="cpu")
     image = np.zeros((260, 260, 3), np.uint8)
-    with pytest.raises(ValueError, match="joint must"):
+    with pytest.raises(ValueError, match="mask0 must"):
         matcher.match(image, image, [(60, 60), (90, 90)], joint=True)
     match = matcher.match(image, image, [(60, 60), (90, 90)], joint=True, mask0=MASK)
     assert match.joint_weights.shape == (4,) and dataclasses.replace(match).modes.shape == (2, 4, 2)

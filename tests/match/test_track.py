@@ -165,7 +165,7 @@ def test_places_by_name_are_followed_with_all_like_them(untrained: Matcher, fram
     ({"xy": None}, "either xy or places must be given, got none"),
     ({"find": "corners"}, "either xy or places must be given, got both"),
     ({"xy": [(90, 20)]}, "xy must be finite and inside image0"),
-    ({"mask0": None}, "learnt no mask"),
+    ({"mask0": None}, "do not know where the object lies"),
     ({"frames": []}, "frames must be images, one or more, got none"),
 ])  # fmt: skip
 def test_what_cannot_be_followed_is_refused(
