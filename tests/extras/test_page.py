@@ -190,6 +190,8 @@ def test_a_tap_has_the_librarys_answer_online_and_offline(
         for xy in ((235, 80), (150, 350), (300, 200)):
             found = tap(page, *xy)
             assert compare(found, pair.match(np.array([xy]))) < 1  # px; the page's network has half precision
+        box = page.locator("table").bounding_box()
+        assert box["x"] + box["width"] <= PHONE["width"]  # nothing is cut off
         after = page.locator("canvas").nth(1).screenshot()
         assert np.mean(np.asarray(Image.open(io.BytesIO(before))) != np.asarray(Image.open(io.BytesIO(after)))) > 0.01
     page.reload(timeout=PATIENCE_MS)  # nobody serves any more
