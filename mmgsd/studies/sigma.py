@@ -117,7 +117,9 @@ def plot_sigma_ablation(
         sigma, error = zip(*points, strict=True)
         axis.plot(sigma, error, "o-", ms=3.5, color=get_colour("mmgsd"))
         others = [row["rmse_mean"] for key, row in (seeds or {}).get(name, {}).items() if OTHER_SEED.match(key)]
-        axis.plot([1.0] * len(others), others, "o", ms=3.5, mfc="none", color=get_colour("mmgsd"))
+        rings = axis.plot([1.0] * len(others), others, "o", ms=3.5, mfc="none", color=get_colour("mmgsd"))
+        if others:
+            axis.legend(rings, ["other seeds"], loc="lower left", handletextpad=0.2, fontsize=6)
         for x, y in points:
             axis.annotate(f"{y:.1f}", (x, y), xytext=(0, 4), textcoords="offset points", ha="center", fontsize=6.5)
         axis.set_xscale("log", base=2)
