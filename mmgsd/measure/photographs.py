@@ -279,10 +279,16 @@ def _summarise(rows: pd.DataFrame) -> dict[str, Any]:
 
 
 def make_photographs_table(summary: dict[str, Any]) -> str:
-    """Text of a summary, a source a row, all of them last."""
-    parts = {**summary["sources"], "all": summary}
+    """Text of a summary: a source a row, all of them, what is found by name, and the 95 % intervals of these two."""
+    whole = {"all": summary, **({"by name": summary["by_name"]} if "by_name" in summary else {})}
+    parts = {**summary["sources"], **whole}
     rows = {name: {key: part[key] for key in ("queries", *MEASURES, "unanswered")} for name, part in parts.items()}
-    return pd.DataFrame.from_dict(rows, orient="index").to_string(float_format="{:.3f}".format)
+    lines = [pd.DataFrame.from_dict(rows, orient="index").to_string(float_format="{:.3f}".format)]
+    for name, part in whole.items():
+        known = {key: part["intervals"][key] for key in ("found@5%", "spurious") if part["intervals"].get(key)}
+        said = [f"{key} {low:.2f} to {high:.2f}" for key, (low, high) in known.items()]
+        lines += [f"95 % intervals, {name}: {', '.join(said)}"] if said else []
+    return "\n".join(lines)
 
 
 def describe_marks(file: str, pins: list[Any], kind: str = "") -> dict[str, Any]:

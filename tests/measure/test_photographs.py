@@ -152,7 +152,9 @@ def test_flat_cloths_are_asked_about_in_every_other_photograph(folder: Path) -> 
     assert (summary["queries"], summary["found@5%"], summary["spurious"], summary["best"]) == (80, 1, 0, 0)
     assert summary["sources"].keys() == {"some/where", "own"}
     assert sum(part["queries"] for part in summary["sources"].values()) == 80
-    assert make_photographs_table(summary).splitlines()[-1].split() == ["all", "80", *["1.000"] * 2, *["0.000"] * 3]
+    *_, every, named, interval, _ = make_photographs_table(summary | {"by_name": summary}).splitlines()
+    assert every.split() == ["all", "80", *["1.000"] * 2, *["0.000"] * 3] and named.split()[:3] == ["by", "name", "80"]
+    assert interval == "95 % intervals, all: found@5% 1.00 to 1.00, spurious 0.00 to 0.00"
 
 
 @pytest.mark.parametrize(
