@@ -12,18 +12,23 @@ away. What is measured is kept, so that a killed call goes on.
 from __future__ import annotations
 
 import tempfile
+import textwrap
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
+from matplotlib import pyplot as plt
+from matplotlib.figure import Figure
 
 from mmgsd.command import Option
 from mmgsd.config import OBJECTS
+from mmgsd.figures.style import PAGE_IN, add_legend, finish_axes, save_figure, styled
 from mmgsd.files import write_json
-from mmgsd.learn.adapt import STEPS, adapt, ask_left_out, read_adaptation
+from mmgsd.learn.adapt import LABELS, STEPS, adapt, ask_left_out, read_adaptation
 from mmgsd.match.matcher import Matcher, load
 from mmgsd.measure.evaluation import read_results
 from mmgsd.measure.photographs import Photograph, read_photographs
@@ -38,6 +43,7 @@ KINDS = {"marked": "with marks", "unmarked": "without marks"}
 SPLITS = 5
 SOURCES = 2  # photographs of every split that are asked by
 LEFT = 4  # a part so large of a repository, at least, is left to be asked about
+COLOURS = {"marked": "#D55E00", "unmarked": "#0072B2"}
 ASKED = {"own": "same repository", "others": "other repositories"}
 COLUMNS = ["found@5%", "spurious"]
 
@@ -75,6 +81,7 @@ def run(
         rows, key = read_results(out), "/".join(map(str, cell))
         if key not in rows:
             write_json(out, {**rows, key: measure_cell(cell, photographs[cell[0]], steps=steps)})
+    save_figure(plot_adaptation(read_results(out)), paths.root / "figures" / "adaptation", kinds=("png",))
     return out
 
 
@@ -138,6 +145,32 @@ def describe_adaptation(results: Results) -> Table:
 
 def _say(part: pd.DataFrame, key: tuple[Any, ...]) -> str:
     return " / ".join(f"{100 * part.loc[key, name]:.0f} %" for name in COLUMNS) if key in part.index else MISSING
+
+
+@styled
+def plot_adaptation(results: Results) -> Figure:
+    """What is found in the rest of a repository by the number of its photographs that were learnt from, a panel each.
+
+    Means over splits, a dot each split; zero photographs are the weights as they are.
+    """
+    rows = tabulate(results)
+    rows = rows[(rows.place == "own") & (rows.repository.isin(rows[rows["count"] > 0].repository))]
+    panels = list(rows.groupby(["object", "repository"], sort=False))
+    size = PAGE_IN, 2.2
+    figure, axes = plt.subplots(1, len(panels), figsize=size, layout="constrained", sharey=True, squeeze=False)
+    for axis, ((object, repository), part) in zip(axes[0], panels, strict=True):
+        for (kind, label), by in product(KINDS.items(), LABELS):
+            found = part[((part.kind == kind) | (part["count"] == 0)) & (part.by == by)]
+            mean, line = 100 * found.groupby("count")["found@5%"].mean(), "o-" if by == "name" else "o--"
+            axis.plot(mean.index, mean, line, ms=3.5, mfc=COLOURS[kind] if by == "name" else "white",
+                      color=COLOURS[kind], label=f"{label}, {LABELS[by]}")  # fmt: skip
+            axis.scatter(found["count"], 100 * found["found@5%"], s=4, color=COLOURS[kind], linewidths=0)
+        name = textwrap.shorten(repository.rpartition("/")[2].replace("-", " "), 24, placeholder=" …")
+        axis.set(title=f"{object}\n{name}", xlabel="photographs learnt from", ylim=(0, 103))
+        axis.set_xticks(sorted(part["count"].unique()))
+    axes[0, 0].set_ylabel("found (%)")
+    add_legend(figure, axes[0])
+    return finish_axes(figure)
 
 
 STUDY = Study(

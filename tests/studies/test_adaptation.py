@@ -11,7 +11,15 @@ import pytest
 from mmgsd.measure.photographs import Photograph
 from mmgsd.paths import Paths
 from mmgsd.studies import adaptation
-from mmgsd.studies.adaptation import describe_adaptation, find_most, list_cells, measure_cell, run, tabulate
+from mmgsd.studies.adaptation import (
+    describe_adaptation,
+    find_most,
+    list_cells,
+    measure_cell,
+    plot_adaptation,
+    run,
+    tabulate,
+)
 from mmgsd.studies.table import to_markdown
 
 
@@ -74,3 +82,7 @@ def test_what_is_measured_is_kept_and_told(
         "| cloth, 2 with marks | 80 % / 10 % | – | 80 % / 10 % | – | +5% |",
     ]
     assert set(tabulate(results)["kind"]) == {"marked"}
+    (axis,) = plot_adaptation(results).axes
+    (line,) = (line for line in axis.lines if line.get_label() == "with marks, by name")
+    assert axis.get_title() == "cloth\nsome" and line.get_xydata().tolist() == [[0, 60], [2, 80]]
+    assert (tmp_path / "figures" / "adaptation.png").is_file()
