@@ -42,7 +42,7 @@ COMMANDS = {  # name: where its function is, seen from this package, and what it
 STUDIES = {  # likewise, of the command ``run``: what has options of its own
     "models": ("studies.matrix.main", "train and ask all models of a preset and its baselines, or those of a study"),
     "shipped": ("studies.shipped.main", "shipped weights and baselines on clean and cluttered renders and photographs"),
-    "joint": ("measure.joint.main", "whether answers to several pixels belong together"),
+    "joint": ("studies.joint.main", "whether answers to several pixels belong together"),
     "continuity": ("studies.continuity.main", "whether the matches of neighbouring points neighbour each other"),
     "grasp": ("studies.grasp.main", "take the corner that one is surest of"),
     "folding": ("studies.folding.main", "fold by one demonstration, every policy from the same states"),

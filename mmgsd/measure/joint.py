@@ -1,7 +1,5 @@
 """Do the answers to several pixels belong together? Questions of three random points, answered jointly and one by one.
 
-    python -m mmgsd run joint cloth rope    of shipped weights -> data/results/joint.json
-
 The test images of the presets `SETS` have to be rendered. A question is right where one member of the symmetry takes
 all its points to within `RADIUS_PX` of the chosen modes. Answers are chosen four ways: each point's heaviest mode; the
 best choice that the modes allow, for which one has to know the truth; the first joint answer (`mmgsd.match.joint`); and
@@ -15,21 +13,19 @@ import hashlib
 import statistics
 import time
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from mmgsd.command import Option
 from mmgsd.config import DEFAULT_GROUP, EvaluateConfig
 from mmgsd.dataset import Dataset, load_dataset
 from mmgsd.match.joint import PLACES, join
 from mmgsd.match.match import RADIUS_PX, Match
 from mmgsd.match.matcher import Matcher, find_weights
-from mmgsd.measure.evaluation import read_results, write_results
 from mmgsd.measure.questions import draw_pairs
 from mmgsd.model.network import name_hardware
-from mmgsd.paths import Paths, find_root
+from mmgsd.paths import Paths
 from mmgsd.progress import ProgressBar
 
 SETS = ("paper", "workspace")  # presets whose test images are asked about
@@ -134,12 +130,3 @@ def summarise_questions(asked: list[dict[str, float]]) -> dict[str, float]:
     means = pd.DataFrame(asked, columns=[*CHOSEN, *SWAPS], dtype=float).mean()
     known = {name: None if np.isnan(mean) else round(float(mean), 4) for name, mean in means.items()}
     return {"questions": len(asked), **known}
-
-
-def main(*names: Annotated[str, Option("of weights in data/weights, or files")]) -> None:
-    """Measure shipped weights, a row each; rows of other names stay."""
-    root = find_root()
-    out = root / "data" / "results" / RESULTS
-    for name in names:
-        write_results(read_results(out) | {name: measure_joint(name, root)}, out)
-    print(f"{out}: {', '.join(names)}")

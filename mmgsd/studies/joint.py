@@ -1,15 +1,19 @@
-"""Whether the answers to several pixels belong together (`mmgsd.measure.joint`)."""
+"""Whether the answers to several pixels belong together (`mmgsd.measure.joint`).
+
+    python -m mmgsd run joint cloth rope    of shipped weights -> data/results/joint.json
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+from mmgsd.command import Option
 from mmgsd.config import OBJECTS
 from mmgsd.measure.evaluation import read_results, write_results
 from mmgsd.measure.joint import RESULTS, measure_joint
-from mmgsd.paths import Paths
+from mmgsd.paths import Paths, find_root
 from mmgsd.studies.registry import Shown, Study
 from mmgsd.studies.shipped import SETS
 from mmgsd.studies.table import Table, make_page_table, say_value
@@ -52,3 +56,8 @@ STUDY = Study(
     "joint", 130, run, shows=lambda paths, **_: [paths.results.parent / RESULTS],
     tables={"joint": Shown(RESULTS, describe_joint), "joint_counts": Shown(RESULTS, make_joint_sentence)},
 )  # fmt: skip
+
+
+def main(*names: Annotated[str, Option("of weights in data/weights, or files")]) -> None:
+    """Measure shipped weights, a row each; rows of other names stay."""
+    print(f"{run(Paths(find_root(), 'paper'), names=names)}: {', '.join(names)}")

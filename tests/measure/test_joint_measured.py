@@ -10,7 +10,8 @@ import pytest
 
 from mmgsd.dataset import load_dataset
 from mmgsd.measure import joint
-from mmgsd.measure.joint import CHOSEN, SWAPS, _measure_swaps, main, summarise_questions
+from mmgsd.measure.joint import CHOSEN, SWAPS, _measure_swaps, summarise_questions
+from mmgsd.studies.joint import main
 
 ROOT = Path(__file__).parents[2]
 
