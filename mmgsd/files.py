@@ -216,9 +216,11 @@ def check_ours(folder: Path, is_ours: Callable[[Path], bool]) -> None:
     """ForeignFileError where a folder holds a file that ``is_ours`` denies, or is a link or a file itself."""
     if folder.is_symlink() or not folder.is_dir():
         raise ForeignFileError(f"{folder} is a link or a file, not our folder: move it, or choose another place")
-    for path in sorted(folder.rglob("*")):
-        if path.is_symlink() or (path.is_file() and not is_ours(path.relative_to(folder))):
-            raise ForeignFileError(f"{path} is none of this project's files: move it away, or choose another folder")
+    for place, folders, names in os.walk(folder):  # from the top: a foreign tree is not walked through
+        folders.sort()
+        for path in (Path(place, name) for name in sorted([*names, *folders])):
+            if path.is_symlink() or (path.name in names and not is_ours(path.relative_to(folder))):
+                raise ForeignFileError(f"{path} is no file of ours: move it away, or choose another folder")
 
 
 @contextmanager
