@@ -13,7 +13,7 @@ import dataclasses
 import hashlib
 import statistics
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import permutations
 from pathlib import Path
 from typing import Any
@@ -65,7 +65,8 @@ def measure_weights(
     Of a set: `mmgsd.measure.metrics.aggregate` over visible sources, `mmgsd.measure.uncertainty.summarise_uncertainty`
     by the weights' own calibration, its ``reliability`` beside a Gaussian's, ``within_radius``, the share of modes with
     a true match within `Match.radius_px` (level 0.9), ``heads`` (`measure_heads`), and of weights that know their
-    places ``asked`` (`measure_by_name`). ``milliseconds``: of one question about two images.
+    places ``asked`` (`measure_by_name`). ``milliseconds``: of one question about two images, and about
+    two that are described already.
     ``presets`` are those whose images stand for `SETS`; without any, neither they nor the time are measured.
     ``cloth_renders`` of a cloth's weights: `measure_cloth_renders`.
     """
@@ -194,15 +195,23 @@ def _list_reliability(modes: pd.DataFrame, promise: Calibration | None) -> dict[
 
 
 def _time_question(matcher: Matcher, root: Path) -> dict[str, Any]:
-    """Median time of one question about two images that were not seen before, what it ran on, the object's size."""
-    data, seconds = load_dataset(root / "data" / "sample" / matcher.object, "test"), []
-    images = [data.load_image(index) for index in range(2)]
+    """Median times of a question about two new images, and about described ones; what it ran on, the object's size."""
+    data = load_dataset(root / "data" / "sample" / matcher.object, "test")
+    images, xy = [data.load_image(index) for index in range(2)], [[s / 2 for s in data.size]]
+    pair = matcher.prepare(*images)
+    ways = {"milliseconds": lambda: matcher.match(*images, xy), "milliseconds_described": lambda: pair.match(xy)}
+    return {**{name: _time(way) for name, way in ways.items()}, "hardware": name_hardware(matcher.device),
+            "side_px": measure_side(data.folder)}  # fmt: skip
+
+
+def _time(way: Callable[[], Any]) -> float:
+    """Milliseconds of a call, the median of `TIMED`."""
+    seconds = []
     for _ in range(TIMED):
         start = time.perf_counter()
-        matcher.match(*images, [[s / 2 for s in data.size]])
+        way()
         seconds.append(time.perf_counter() - start)
-    return {"milliseconds": round(1000 * statistics.median(seconds), 1), "hardware": name_hardware(matcher.device),
-            "side_px": measure_side(data.folder)}  # fmt: skip
+    return round(1000 * statistics.median(seconds), 1)
 
 
 def measure_side(folder: Path) -> float:

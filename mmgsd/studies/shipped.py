@@ -93,11 +93,16 @@ def describe_limits(rows: Rows) -> Table:
         "in photographs": "found within 5 % of the size, a development set: {} of a cloth's corners by name, {} by "
                           "another picture ({} of the questions not answered); of a rope's ends {} and {} ({})".format(
                               *seen[0], *seen[1]),
-        "it takes": f"{slowest['milliseconds']:.0f} ms for two new images and a question ({slowest['hardware']}); "
-                    "a GPU is not needed",
+        "it takes": f"{slowest['milliseconds']:.0f} ms for two new images and a question{_tell_described(slowest)} "
+                    f"({slowest['hardware']}); a GPU is not needed",
         "on a robot": "never tried",
     }  # fmt: skip
     return make_page_table([" "], {name: [text] for name, text in lines.items()})
+
+
+def _tell_described(row: Mapping[str, Any]) -> str:
+    time = row.get("milliseconds_described")
+    return "" if time is None else f", {time:.0f} ms for a further question about them"
 
 
 def _tell_error(row: Mapping[str, Any], preset: str) -> str:
