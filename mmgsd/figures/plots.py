@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 
 _ORBIT_COLOURS = ("#D55E00", "#56B4E9", "#FFE100", "#009E73")
 MOST_MODES = 8  # of a material point under any group
+TITLE = 40  # characters that fit above one of two panels
 PAGE_QUERIES, PANEL_PX = 100, 640  # on one page at most; the longer side of an image in a panel of it
 
 
@@ -42,7 +44,8 @@ def plot_match(match: Match, index: int = 0) -> Figure:
     style.show_source(axes[0, 0], match, index)
     style.show_answer(axes[0, 1], match, index)
     axes[0, 0].set_title("Source")
-    axes[0, 1].set_title(match.say_presence(index) or f"Matches · entropy {match.entropy[index]:.1f} nats")
+    said = textwrap.fill(match.say_presence(index), TITLE)
+    axes[0, 1].set_title(said or f"Matches · entropy {match.entropy[index]:.1f} nats")
     return figure
 
 
