@@ -14,6 +14,7 @@ import numpy as np
 RADIUS = 0.08  # of the questions' extent: as near as a mode is to where the motion takes its pixel, where both agree
 ROUNDS = 8  # in which questions take their nearest modes, and the motion is fitted again
 MAX_SCALE = 1.25  # of two questions' distance, by which it may grow or shrink where the scale is known
+ALIKE = 0.98  # of the best motion's weight: others that have so much are as good, and differ by their scale alone
 MAX_FREE_SCALE = 3.0  # and where it is not: by more, a picture is from elsewhere, or all questions took one place
 
 
@@ -47,9 +48,10 @@ def find_consensus(
 
     Questions ``asked`` (S, 2) and modes are in one unit; None where no two are at a possible distance.
     Every two questions and their modes propose a motion, with their distance's scale where ``free_scale``; the one
-    whose modes near by weigh most is fitted again to these, of like ones that with the scale nearest to one: like
-    corners answer for each other, so that a square's fit its own diagonals, or a point. NaN modes do not count.
-    ValueError for fewer than two questions, or all at one place.
+    whose modes near by weigh most is fitted again to these. Of those that weigh alike it is the one with the scale
+    nearest to one, so that the unit should be about the same on both sides: like corners answer for each other, and fit
+    a square's diagonals, or a point, as well. NaN modes do not count. ValueError for fewer than two questions, or all
+    at one place.
     """
     source, target = to_complex(asked), to_complex(modes)  # (S,), (S, n)
     extent = find_extent(asked)
@@ -59,13 +61,18 @@ def find_consensus(
     motions = _propose(source, target, free_scale)  # (M, 2)
     if not len(motions):
         return None
-    scores = [_weigh(motion, source, target, weights, 2 * RADIUS * extent).max(1).sum() / _stretch(motion) ** 0.5
-              for motion in motions]  # fmt: skip
-    motion = motions[int(np.argmax(scores))]
+
+    def weigh(motion: np.ndarray) -> np.ndarray:
+        """(S, n): the modes' weights by how near the motion comes to them."""
+        return _weigh(motion, source, target, weights, 2 * RADIUS * extent * (abs(motion[0]) if free_scale else 1))
+
+    scores = np.array([weigh(motion).max(1).sum() for motion in motions])
+    stretch = np.array([_stretch(motion) for motion in motions]) if free_scale else np.ones(len(motions))
+    alike = scores >= (ALIKE if free_scale else 1) * scores.max()
+    motion = motions[int(np.argmin(np.where(alike, stretch, np.inf)))]
     for _ in range(3):
-        near = _weigh(motion, source, target, weights, 2 * RADIUS * extent)
-        motion = _fit(source, target, near, motion, free_scale)
-    near = _weigh(motion, source, target, weights, 2 * RADIUS * extent)
+        motion = _fit(source, target, weigh(motion), motion, free_scale)
+    near = weigh(motion)
     return Motion(*map(complex, motion)), float(np.mean(near.max(1) > 0))
 
 

@@ -115,14 +115,33 @@ def answer_picture(
         raise ValueError(f"picks and anchors must be on the object of the demonstration, these are not: {off}")
     if match.absent is not None and match.absent[0] > 0.5:
         raise ValueError(f"the picture must show a {demonstration.object}, none is seen in it")
-    zoom = max(image.shape[:2]) / max(shown.image.shape[:2])  # a picture of more pixels is none from nearer by
+    zoom = _estimate_zoom(matcher, shown, match, by_name=by_name)
     answer = choose_moves(shown, match, chosen, lambda xy: zoom * xy, np.asarray, free_scale=True)
-    before, after = zoom * find_extent(shown.moves[:, 0]), find_extent(answer.moves[:, 0])
-    if after * MAX_FREE_SCALE < before:
-        raise ValueError("the picture's answers to the picks must lie apart as these do, chosen by "
-                         f"{chosen!r} they are at one place, {answer.moves[0, 0].round().tolist()}: "
-                         f"choose {JOINT!r}")  # fmt: skip
     if answer.share < LEAST:
         raise ValueError(f"the picture's answers must agree with the demonstration, {answer.share:.0%} of them do: "
                          "take it from where the demonstration was taken, or add anchors")  # fmt: skip
-    return answer
+    if find_extent(answer.moves[:, 0]) * MAX_FREE_SCALE < zoom * find_extent(shown.moves[:, 0]):
+        raise ValueError("the picture's answers to the picks must lie apart as these do, chosen by "
+                         f"{chosen!r} they are at one place, {answer.moves[0, 0].round().tolist()}: choose another of "
+                         f"{[AGREE, JOINT]}")  # fmt: skip
+    motion = answer.motion and Motion(zoom * answer.motion.factor, answer.motion.shift)
+    return PolicyAnswer(answer.moves, motion, answer.share)
+
+
+def _estimate_zoom(matcher: Matcher, look: Look, match: Match, *, by_name: bool) -> float:
+    """How much larger the object is in a new picture: by how far all answers lie from each other, in both pictures.
+
+    Where the look's picture is not asked about, by the pictures' sizes: one of more pixels is none from nearer by.
+    """
+    if not by_name:
+        own = matcher.match(look.image, look.image, look.asked)
+        before, after = (_measure_spread(each.modes) for each in (own, match))
+        if before > 0 and after > 0:
+            return after / before
+    return max(match.image1.shape[:2]) / max(look.image.shape[:2])
+
+
+def _measure_spread(modes: np.ndarray) -> float:
+    """The root mean square distance of modes (S, n, 2) from their mean; 0 of none."""
+    places = modes[np.isfinite(modes).all(-1)]
+    return float(np.sqrt(((places - places.mean(0)) ** 2).sum(1).mean())) if len(places) else 0.0

@@ -56,12 +56,21 @@ def test_the_scale_is_free_where_no_camera_tells_it(rng: np.random.Generator) ->
     assert abs(motion.factor) == pytest.approx(1.7, rel=1e-6) and share == 1
 
 
-@pytest.mark.parametrize("count", [2, 3, 4])
-def test_like_corners_are_neither_one_place_nor_a_diagonal(count: int) -> None:
-    corners = Motion(0.9 * np.exp(0.4j), 0.1 + 0j).apply(ASKED[:4])
+@pytest.mark.parametrize(("count", "scale"), [(2, 0.9), (2, 1.3), (3, 0.75), (4, 0.5), (4, 1.0), (4, 1.5)])
+def test_like_corners_are_neither_one_place_nor_a_diagonal(count: int, scale: float) -> None:
+    corners = Motion(scale * np.exp(0.4j), 0.1 + 0j).apply(ASKED[:4])
     modes = np.tile(corners, (count, 1, 1))  # each is asked for a corner, and any corner is as good an answer
     motion, share = find_consensus(ASKED[:count], modes, np.full((count, 4), 0.25), free_scale=True)
-    assert abs(motion.factor) == pytest.approx(0.9, rel=1e-6) and share == 1
+    assert abs(motion.factor) == pytest.approx(scale, rel=1e-6) and share == 1
+
+
+def test_all_questions_weigh_more_than_a_scale_near_one() -> None:
+    asked = np.array([[-0.4, 0.4], [0.4, 0.4], [0.1, 0.05]])
+    truth = Motion(0.4 * np.exp(0.4j), 0.1 + 0j)
+    corners = truth.apply(ASKED[:4])
+    inner = truth.apply(np.stack([Motion(1j**k, 0j).apply(asked[2]) for k in range(4)]))
+    motion, share = find_consensus(asked, np.stack([corners, corners, inner]), np.full((3, 4), 0.25), free_scale=True)
+    assert abs(motion.factor) == pytest.approx(0.4, rel=1e-6) and share == 1
 
 
 def test_nothing_agrees_with_no_modes() -> None:

@@ -13,8 +13,9 @@ from PIL import Image
 import mmgsd
 from mmgsd.__main__ import main
 from mmgsd.dataset import load_dataset
+from mmgsd.fold import moves
 from mmgsd.fold.consensus import Motion, to_complex, to_points
-from mmgsd.fold.demonstration import Demonstration, Look, write_demonstration
+from mmgsd.fold.demonstration import Demonstration, Look, read_demonstration, write_demonstration
 from mmgsd.fold.moves import AGREE, BEST, PolicyAnswer, answer_picture, choose_moves
 from mmgsd.match.match import Match
 
@@ -113,12 +114,25 @@ def test_corners_alone_are_picked_apart_and_no_pick_takes_anothers_place(data) -
     look = Look(data.load_image(DEMO), np.stack([corners[:2], corners[[3, 2]]], 1), corners[2:])
     demonstration, side = Demonstration("cloth", (look,)), np.linalg.norm(corners[1] - corners[0])
     large = np.asarray(Image.fromarray(data.load_image(NOW)).resize((2000, 2000)))
-    for image, factor in ((data.load_image(DEMO), 1.0), (data.load_image(NOW), 1.0), (large, 2000 / 485)):
-        picks = answer_picture(matcher, demonstration, image).moves[:, 0] / factor
-        assert 0.6 * side < np.linalg.norm(picks[1] - picks[0]) < 1.2 * side
-    with pytest.raises(ValueError, match="'best' they are at one place, .* choose 'joint'"):
-        for image in map(data.load_image, range(len(data))):  # the surest corner, each time
-            answer_picture(matcher, demonstration, image, chosen=BEST)
+    small = np.full_like(data.load_image(NOW), 120)  # as from farther away
+    small[80:380, 90:390] = np.asarray(Image.fromarray(data.load_image(NOW)).resize((300, 300)))
+    for image, factor in ((data.load_image(DEMO), 1.0), (data.load_image(NOW), 1.0), (large, 2000 / 485),
+                          (small, 300 / 485)):  # fmt: skip
+        answer = answer_picture(matcher, demonstration, image)
+        picks = answer.moves[:, 0]
+        assert 0.6 * side < np.linalg.norm(picks[1] - picks[0]) / factor < 1.2 * side
+        gap = np.linalg.norm(answer.motion.apply(look.moves[:, 0]) - picks, axis=1)
+        assert gap.max() < 0.2 * side * factor  # the motion is that of the demonstration's own pixels
+    with pytest.raises(ValueError, match="'best' they are at one place, .* choose another of"):
+        edge = read_demonstration(SAMPLE.parents[1] / "demonstrations" / "edge.json")
+        answer_picture(matcher, edge, data.load_image(NOW), chosen=BEST)  # the surest corner, each time
+
+
+def test_a_pick_without_an_answer_is_said(data, demonstration, monkeypatch: pytest.MonkeyPatch) -> None:
+    nothing = PolicyAnswer(np.zeros((0, 2, 2)), None, 0.0)
+    monkeypatch.setattr(moves, "choose_moves", lambda *_, **__: nothing)
+    with pytest.raises(ValueError, match="must agree with the demonstration, 0% of them do"):
+        answer_picture(mmgsd.load("cloth"), demonstration, data.load_image(NOW), chosen=BEST)
 
 
 def test_an_empty_table_and_a_pick_beside_the_cloth_are_no_answers(data, demonstration) -> None:
