@@ -15,7 +15,8 @@ import sys
 import threading
 import typing
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 KEPT = "what was finished is kept, and the same command goes on from there"
@@ -76,20 +77,43 @@ def run_command(main: Callable[[], None], *, kept: str = KEPT) -> None:
     through.
     """
     _print_anywhere()
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, signal.default_int_handler)  # `timeout` and systemd stop a run as Ctrl-C does
-    warnings.formatwarning = lambda message, *_, **__: f"warning: {message}\n"  # not where in which file
     if os.environ.get("MMGSD_TRACEBACK", "0") not in ("", "0"):
         main()
         return
     try:
-        main()
+        with _stopped_by_sigterm(), _warning_in_a_line():
+            main()
     except KeyboardInterrupt as stopped:
         _leave(f"stopped: {str(stopped) or kept}", 130)
     except BrokenPipeError:  # who reads the output has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except Exception as error:
         _leave(f"error: {describe_error(error)}", 2 if isinstance(error, WRONG) else 1)
+
+
+@contextmanager
+def _stopped_by_sigterm() -> Iterator[None]:
+    """Let `timeout` and service managers stop a run as Ctrl-C does, where nobody has said otherwise."""
+    own = threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    if own:
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        if own:
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+@contextmanager
+def _warning_in_a_line() -> Iterator[None]:
+    """Say what warns, and not in which file."""
+    before = warnings.formatwarning
+    warnings.formatwarning = lambda message, kind, *place: (
+        f"warning: {message}\n" if kind is UserWarning else before(message, kind, *place))  # fmt: skip
+    try:
+        yield
+    finally:
+        warnings.formatwarning = before
 
 
 def _print_anywhere() -> None:

@@ -218,9 +218,10 @@ def check_ours(folder: Path, is_ours: Callable[[Path], bool]) -> None:
         raise ForeignFileError(f"{folder} is a link or a file, not our folder: move it, or choose another place")
     for place, folders, names in os.walk(folder):  # from the top: a foreign tree is not walked through
         folders.sort()
+        files = set(names)
         for path in (Path(place, name) for name in sorted([*names, *folders])):
-            if path.is_symlink() or (path.name in names and not is_ours(path.relative_to(folder))):
-                raise ForeignFileError(f"{path} is no file of ours: move it away, or choose another folder")
+            if path.is_symlink() or (path.name in files and not is_ours(path.relative_to(folder))):
+                raise ForeignFileError(f"{path} was not written by mmgsd: move it away, or choose another folder")
 
 
 @contextmanager

@@ -92,7 +92,7 @@ def _spelling(path: Path) -> Iterator[Path]:
         str(path).encode()
     except UnicodeEncodeError:
         with tempfile.TemporaryDirectory() as place:
-            link = Path(place, "video").with_suffix(path.suffix.encode("ascii", "ignore").decode())
+            link = Path(place, "video" + path.suffix.encode("ascii", "ignore").decode().rstrip("."))
             link.symlink_to(path.absolute())
             yield link
     else:
@@ -103,22 +103,25 @@ def _spelling(path: Path) -> Iterator[Path]:
 def writing_video(path: Path, rate: float) -> Iterator[Callable[[np.ndarray], None]]:
     """Give what takes frames (H, W, 3) uint8 RGB of one size, ``rate`` a second; the file appears whole or not at all.
 
-    ValueError where its name does not end as `CODECS` do, RuntimeError where this OpenCV cannot write such a file,
-    OSError where it lacks frames, as on a full disk, which FFmpeg tells nobody.
+    ValueError where its name does not end as `CODECS` do, and for a frame of another size, RuntimeError where this
+    OpenCV cannot write such a file, OSError where it lacks frames, as on a full disk, which FFmpeg tells nobody.
     """
     check_choice("ending of a video that is written", path.suffix.lower(), tuple(CODECS))
     path.parent.mkdir(parents=True, exist_ok=True)
     with scratch_folder(path.parent, path.name) as scratch, _spelling(scratch) as folder:
         inside, writer, count = folder / f"video{path.suffix.lower()}", cv2.VideoWriter(), 0
-        kind = cv2.VideoWriter_fourcc(*CODECS[inside.suffix])
+        kind, size = cv2.VideoWriter_fourcc(*CODECS[inside.suffix]), ()
 
         def write(frame: np.ndarray) -> None:
             """Add a frame; the first one opens the file."""
-            nonlocal count
-            count += 1
+            nonlocal count, size
+            size = size or frame.shape
+            if frame.shape != size:
+                raise ValueError(f"frames must be as large as the first one, {size}, got {frame.shape}")
             if not (writer.isOpened() or writer.open(str(inside), cv2.CAP_FFMPEG, kind, rate, frame.shape[1::-1])):
                 raise RuntimeError(f"this OpenCV cannot write {path.suffix} videos: choose another of {[*CODECS]}")
             writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
+            count += 1
 
         try:
             yield write

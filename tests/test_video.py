@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -44,9 +45,13 @@ def test_a_name_that_is_no_utf8_is_written_and_read(tmp_path: Path) -> None:
 
 
 def test_a_video_that_lost_frames_takes_no_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    class FullDisk(cv2.VideoWriter):
-        def write(self, frame: np.ndarray) -> None:
-            """Lose it, as FFmpeg does without a word."""
+    class FullDisk:
+        """Loses frames, as FFmpeg does without a word."""
+
+        def __init__(self, writer: Callable = cv2.VideoWriter) -> None:  # a type that cannot be inherited from
+            inner = writer()
+            self.isOpened, self.open, self.release = inner.isOpened, inner.open, inner.release
+            self.write = lambda frame: None
 
     path = tmp_path / "a.mp4"
     path.write_bytes(b"what was there")
@@ -64,6 +69,13 @@ def test_videos_are_read_where_opencv_moved_its_log_level(tmp_path: Path, monkey
     monkeypatch.delattr(cv2, "setLogLevel", raising=False)  # 4.13 and later
     monkeypatch.setattr(cv2.utils, "logging", moved, raising=False)
     assert len(list(open_video(tmp_path / "a.avi"))) == 1
+
+
+def test_frames_of_two_sizes_are_no_video(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="as large as the first one"), writing_video(tmp_path / "a.mp4", 10) as write:
+        write(make_frames()[0])
+        write(np.zeros((64, 80, 3), np.uint8))
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_what_fails_while_it_is_written_leaves_nothing(tmp_path: Path) -> None:

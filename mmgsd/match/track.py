@@ -117,7 +117,7 @@ class Tracker:
         if match.on_object is not None:
             self._on_object = match.on_object[: len(self._points)]
             if (off := self._on_object < LIKELY).any():
-                warnings.warn(f"these pixels are more likely background: {self._points[off].tolist()}", stacklevel=4)
+                warnings.warn(f"these pixels are more likely background: {self._points[off].tolist()}", stacklevel=3)
         lain = np.full((*order.shape, 2), np.nan)
         lain[:, 0] = match.xy  # the member that leaves all as it is
         self._remember(lain, _start(order.shape[1]))
@@ -185,7 +185,7 @@ class Tracker:
         taken = np.arange(len(rows)), np.take_along_axis(order, chosen[:, None], 1)[:, 0]
         visible = np.full(len(rows), np.nan) if match.visible is None else match.visible[taken]
         if self._on_object is not None:
-            visible = np.where(self._on_object < LIKELY, np.minimum(visible, self._on_object), visible)
+            visible = np.where(self._on_object < LIKELY, np.fmin(visible, self._on_object), visible)
         return Tracked(places, visible, match.confidence()[taken] * sure, absent)
 
 

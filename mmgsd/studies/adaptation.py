@@ -74,14 +74,15 @@ def run(
 
     Errors are those of `mmgsd.measure.photographs.read_photographs`.
     """
-    out = out or paths.results.parent / RESULTS
+    own, out = out is None, out or paths.results.parent / RESULTS  # the figure is of the repository's results
     photographs = {object: read_photographs(folder, object) for object in objects}
     cells = list(list_cells(photographs, counts=counts, splits=splits))
     for cell in ProgressBar(cells, desc="adaptation", disable=not progress, leave=False):
         rows, key = read_results(out), "/".join(map(str, cell))
         if key not in rows:
             write_json(out, {**rows, key: measure_cell(cell, photographs[cell[0]], steps=steps)})
-    save_figure(plot_adaptation(read_results(out)), paths.root / "figures" / "adaptation", kinds=("png",))
+    if own and (figure := plot_adaptation(read_results(out))):
+        save_figure(figure, paths.root / "figures" / "adaptation", kinds=("png",))
     return out
 
 
@@ -148,12 +149,14 @@ def _say(part: pd.DataFrame, key: tuple[Any, ...]) -> str:
 
 
 @styled
-def plot_adaptation(results: Results) -> Figure:
+def plot_adaptation(results: Results) -> Figure | None:
     """What is found in the rest of a repository by the number of its photographs that were learnt from, a panel each.
 
-    Means over splits, a dot each split; zero photographs are the weights as they are.
+    Means over splits, a dot each split; zero photographs are the weights as they are. None where nothing was learnt.
     """
     rows = tabulate(results)
+    if rows.empty or not rows["count"].any():
+        return None
     rows = rows[(rows.place == "own") & (rows.repository.isin(rows[rows["count"] > 0].repository))]
     panels = list(rows.groupby(["object", "repository"], sort=False))
     size = PAGE_IN, 2.2

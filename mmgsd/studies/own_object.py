@@ -59,7 +59,7 @@ def measure(weights: Path, images: Path, paths: Paths, name: str, **how: Any) ->
 
 
 def find_shown(paths: Paths, name: str) -> Paths:
-    """The preset whose answers are shown: `quick` instead of `smoke`, where it holds a picture of the object."""
+    """The preset whose answers are shown: `quick` instead of `smoke`, where it has a picture and errors of it."""
     quick = Paths(paths.root, "quick")
-    stored = (quick.figures / f"your_object_{name}.jpg").is_file()
+    stored = (quick.figures / f"your_object_{name}.jpg").is_file() and name in read_results(quick.results / RESULTS)
     return quick if paths.preset == "smoke" and stored else paths

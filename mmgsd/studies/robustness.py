@@ -56,7 +56,7 @@ def plot_robustness(rows: Rows) -> Figure:
         for place, name in zip(places, names, strict=True):
             found = get_photographs(rows, name) if part == "photographs" else rows[name].get(part, {})
             value, named = found.get(key), found.get("by_name", {}).get(key)
-            interval = [scale * bound for bound in (found.get("intervals") or {}).get(key, ())]
+            interval = [scale * bound for bound in (found.get("intervals") or {}).get(key) or ()]
             _draw_bar(axis, place, name, value and scale * value, named and scale * named, interval)
             if value and found.get("unanswered"):
                 axis.texts[-1].set_text(f"{axis.texts[-1].get_text()}; {100 * found['unanswered']:.0f} not answered")
