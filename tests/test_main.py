@@ -324,7 +324,8 @@ def test_photographs_are_measured(weights, marked, capsys, tmp_path, monkeypatch
     monkeypatch.setattr("mmgsd.measure.photographs.find_root", lambda: tmp_path)
     asked = ["measure", marked, "--weights", weights]
     table = run(capsys, *asked, "--out", tmp_path / "sheet.png", "--store", "mine")
-    assert table.splitlines()[-1].split()[:2] == ["all", "8"]
+    every, named = (line.split() for line in table.splitlines()[2:4])
+    assert every[:2] == ["all", "8"] and named[:2] == ["by", "name"]
     assert Image.open(tmp_path / "sheet.png").size[0] > 300
     results = json.loads(run(capsys, *asked, "--json"))
     assert json.loads((tmp_path / "data" / "results" / "photographs_mine.json").read_text()) == results

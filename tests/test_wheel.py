@@ -26,7 +26,7 @@ IMAGES = [str(SAMPLE / f"test_{name}_00.webp") for name in ("000007", "000002")]
 SOURCES = ("pyproject.toml", "README.md", "LICENSE", "mmgsd", "data/weights", "data/sample")
 NEWER = re.compile(  # than Python 3.10; of the syntax, ruff tells
     r"file_digest|datetime\.UTC|StrEnum|tomllib|typing import .*\b(Self|override|Never)\b|catch_warnings\(\w"
-    r"|itertools\.batched|ExceptionGroup|asyncio\.(TaskGroup|timeout)|contextlib\.chdir|math\.(cbrt|exp2|sumprod)|\.walk\("
+    r"|itertools\.batched|ExceptionGroup|asyncio\.(TaskGroup|timeout)|contextlib\.chdir|math\.(cbrt|exp2|sumprod)|(?<!os)\.walk\("
 )
 # Before anything is imported: only the wheel's folder, the light dependencies and those of some extras are there.
 REFUSE = """
