@@ -13,6 +13,7 @@ from typing import Annotated
 
 import pytest
 
+import mmgsd
 from mmgsd.__main__ import COMMANDS, STUDIES, main, make_parser
 from mmgsd.command import Option, add_arguments, call, run_command
 
@@ -152,3 +153,9 @@ def test_sigterm_is_as_ctrl_c(capsys: pytest.CaptureFixture) -> None:
     finally:
         signal.signal(signal.SIGTERM, before)
     assert stopped.value.code == 130 and "all is kept" in capsys.readouterr().err
+
+
+def test_the_version_is_told(capsys: pytest.CaptureFixture) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        main(["--version"])
+    assert stopped.value.code == 0 and capsys.readouterr().out == f"mmgsd {mmgsd.__version__}\n"

@@ -218,3 +218,7 @@ def test_what_notebooks_show_is_shown_as_what_it_is(path: Path) -> None:
         assert "Empty DataFrame" not in data.get("text/plain", ""), "an empty table"
         if "the explorer" in data.get("text/plain", ""):
             assert "image/jpeg" in data, "a page that runs nothing shows nothing"
+
+
+def test_the_interface_names_no_former_names() -> None:
+    assert "Deprecated" not in (ROOT / "docs" / "api.md").read_text("utf-8")

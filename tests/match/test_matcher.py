@@ -425,3 +425,8 @@ def test_no_more_than_the_last_few_images_are_kept() -> None:
     for value in range(20):
         recent.describe([np.full((2, 2, 3), value, np.uint8), np.zeros((2, 2, 3), np.uint8)])
     assert list(recent._said.values()) == [18, 19, 0]
+
+
+def test_a_device_that_is_not_there_is_not_the_files_fault() -> None:
+    with pytest.raises(ValueError, match=r"^device must"):
+        load("cloth", device="abacus")
