@@ -64,6 +64,7 @@ def renamed(old: str, new: str) -> property:
     """An attribute under its former name ``old``, which warns and gives that of the ``new`` one."""
 
     def get(self: object) -> Any:
+        """The value of the present name."""
         warnings.warn(f"{type(self).__name__}.{old} is called {new} now", DeprecationWarning, stacklevel=2)
         return getattr(self, new)
 

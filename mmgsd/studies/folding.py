@@ -452,13 +452,16 @@ def plot_success(results: Mapping[str, Any]) -> Figure:
     size = PAGE_IN, 0.7 + 0.2 * len(names)
     figure, axes = plt.subplots(1, len(OBJECTS), figsize=size, layout="constrained", sharey=True)
     for axis, object in zip(axes, OBJECTS, strict=True):
+        counted = get(rows, object, "truth", "reachable", "success", "count") or 0
         for place, name in enumerate(names):
             said = get(rows, object, name, "reachable", "success")
             if said:
                 mean, low, high = (100 * said[key] for key in ("mean", "low", "high"))
                 axis.errorbar(mean, place, xerr=[[mean - low], [high - mean]], fmt="o", ms=4, capsize=2,
                               color=POLICIES[name].colour)  # fmt: skip
-        counted = get(rows, object, "truth", "reachable", "success", "count") or 0
+                if said["count"] != counted:
+                    axis.annotate(f"of {said['count']}", (high, place), xytext=(5, 0), textcoords="offset points",
+                                  va="center", fontsize=6)  # fmt: skip
         axis.set(title=f"{object.capitalize()}, {counted} rollouts", xlabel="Success (%)", xlim=(-4, 104))
     axes[0].set_yticks(range(len(names)), [POLICIES[name].label.replace("`", "") for name in names])
     axes[0].invert_yaxis()

@@ -217,6 +217,7 @@ def make_command(name: str) -> Callable[..., None]:
         set: Annotated[list, Option("of what the study's `run` takes; may be given several times", type=read_option,
                                     action="append", metavar="NAME=VALUE")] = None,
     ) -> None:  # fmt: skip
+        """Run the study, and print where its results are."""
         print(run_study(name, preset, **dict(set or ())))
 
     run.__module__ = next(module.__name__ for module in list_modules() if module.STUDY.name == name)  # for its words

@@ -133,6 +133,7 @@ def test_every_claim_can_hold() -> None:
         ("continuous", ("continuity", "cloth", "spcl", "jumps"), 0.1, IN_PART),
         ("bimodal", ("peaks", "cloth"), 1, IN_PART),
         ("hidden", ("entropy", "rope", "overhand knot"), 8.0, IN_PART),
+        ("hidden", ("entropy", "rope", "loops"), 10.5, IN_PART),  # above straight ropes, below others
         ("surest", ("grasp", "mmgsd", "surest", "beyond", "high"), 0.001, NOT_HELD),
         ("sigma", ("sigma", "cloth", "4", "rmse_mean"), 41.0, IN_PART),  # within the margin
         ("interior", ("places", "rope", "middle"), 20.0, IN_PART),
