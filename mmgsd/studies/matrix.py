@@ -4,8 +4,8 @@
     python -m mmgsd run models paper --only cloth-spcl                those whose name holds that text
     python -m mmgsd run models paper --scheduler tcp://host:8786      each worker one model at a time, on its own GPU
     python -m mmgsd run models quick --seeds 3                        instead the seeds study, each model with three
-    python -m mmgsd run models paper --study robustness               instead the models of one study
-    python -m mmgsd run models quick --study robustness --steps 300   each of so many steps
+    python -m mmgsd run models paper --study backbones                instead the models of one study
+    python -m mmgsd run models paper --study backbones --steps 1500   each of so many steps
 
 Notebooks find the models and their tables of answers where they would have put them.
 """
@@ -34,7 +34,7 @@ from mmgsd.studies.claims import get
 from mmgsd.studies.models import RUN, STUDIES, configure_study, list_rows, list_runs, vary_seed, vary_sigma
 from mmgsd.studies.parameters import read_scheduler
 
-TABLES = ("budget", "robustness", "backbones")  # studies with a file of their own, of models under their rows' names
+TABLES = ("budget", "backbones")  # studies with a file of their own, of models under their rows' names
 ALL = "`.venv/bin/python -m mmgsd run models paper`"  # as documents say it
 PROCESSES = 4  # side by side at most: each takes a gigabyte
 VALIDATIONS = 8  # RMSE on held-out simulations, in a model's log
@@ -111,6 +111,40 @@ def train_and_ask(
     return weights, evaluation.evaluate_model(weights, data, config, paths.queries(model.name), **how)
 
 
+def list_missing(models: Mapping[str, TrainConfig], file: Path, place: Sequence[str]) -> dict[str, TrainConfig]:
+    """Those whose row is not in a results file {…: {key: row}} at a ``place``, or is of another training."""
+    there = get(evaluation.read_results(file, depth=len(place) + 1), *place) or {}
+    return {key: model for key, model in models.items() if get(there, key, "run", "model") != model.name}
+
+
+def measure_each(
+    models: Mapping[str, TrainConfig], file: Path, place: Sequence[str], ask: Callable[..., dict[str, Any]], *,
+    desc: str,
+) -> None:  # fmt: skip
+    """Put ``ask(model, progress=…)`` of every model into a results file {…: {key: row}} at a ``place``, one by one."""
+    for key, row in run_each(ask, models, desc=desc):
+        results = evaluation.read_results(file, depth=len(place) + 1)
+        rows = results
+        for name in place:
+            rows = rows.setdefault(name, {})
+        rows[key] = row
+        evaluation.write_results(results, file)
+
+
+def train_and_measure(
+    model: TrainConfig, *, paths: Paths, place: Path, name: str, images: Path, asked: Mapping[str, Path], progress: bool
+) -> dict[str, Any]:  # fmt: skip
+    """{where: errors} of a model trained on some ``images``, for each data set it is ``asked`` about, and its "run".
+
+    Weights and answers are kept in ``place``, under ``name``.
+    """
+    weights = train_model(model, images, place / "models" / name, progress=progress)
+    questions, queries = load_preset(paths.preset).evaluate, place / "queries"
+    tables = {where: evaluation.evaluate_model(weights, data, questions, queries / f"{name}-{where}.parquet",
+                                               progress=progress) for where, data in asked.items()}  # fmt: skip
+    return evaluation.summarise(tables) | {"run": describe_run(weights)}
+
+
 def run_each(
     function: Callable[..., Any], tasks: Mapping[Any, Any], *, desc: str, device: str = ""
 ) -> Iterator[tuple[Any, Any]]:  # fmt: skip
@@ -184,7 +218,7 @@ def write_study_table(
     """Write {object: {row: errors, and under "run" the cost}} of a study where any is done, as `write_tables` does.
 
     ``values`` are σ (px), besides the preset's, or seeds, besides those that are there. The models of other ``steps``
-    than the study's have a file of their own: robustness_300.json. Of those compared by seeds that the study of the
+    than the study's have a file of their own: backbones_1500.json. Of those compared by seeds that the study of the
     smaller budget has as well, its rows are taken where there are no others.
     """
     paths, file = Paths(root, preset.name), f"{study}_{steps}.json" if steps else f"{study}.json"

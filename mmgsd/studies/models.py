@@ -150,7 +150,7 @@ SHIPPED = {f"round{ROUNDS['cloth']}": "", "mmgsd": "-paper", "spcl": "-spcl"}
 SMALL = ("symmetry", "budget", "sigma", "fixes", "robustness", "backbones")  # studies of the equal, smaller budget
 RUN = ("first", "symmetry", "budget", "sigma", "main")  # studies that are run unless one is named, in this order
 # on a preset's own images and one seed: not "fixes" and "seeds"
-STUDIES = (*RUN, "robustness", "backbones")
+STUDIES = (*RUN, "backbones")
 
 
 def list_rows(study: str) -> list[Model]:

@@ -24,14 +24,12 @@ from matplotlib.figure import Figure
 from mmgsd.checks import check_choice, read_count
 from mmgsd.config import OBJECTS, TrainConfig, load_preset
 from mmgsd.figures.style import PAGE_IN, finish_axes, save_figure, styled
-from mmgsd.learn.training import train_model
-from mmgsd.measure.evaluation import evaluate_model, read_results, summarise, write_results
-from mmgsd.model.tensors import describe_run
+from mmgsd.measure.evaluation import read_results
 from mmgsd.paths import Paths
 from mmgsd.progress import ProgressBar
 from mmgsd.scene.stage import render_dataset
 from mmgsd.studies.claims import MARGIN, Claim, get
-from mmgsd.studies.matrix import run_each
+from mmgsd.studies.matrix import list_missing, measure_each, train_and_measure
 from mmgsd.studies.models import ROWS, Model, configure_study, get_colour, get_label, get_line_style
 from mmgsd.studies.registry import Results, Shown, Study, read_table
 from mmgsd.studies.seeds import compare_seeds, list_seeds, say_seeds
@@ -74,15 +72,11 @@ def run(paths: Paths, *, seeds: int = SEEDS, objects: str | Sequence[str] = OBJE
     file = paths.results / "pose_range.json"
     arms = [(name, limit) for name in _list_objects(objects) for limit in LIMITS_DEG]
     for name, limit in ProgressBar(arms, desc="limits"):
-        there = get(read_results(file, depth=3), name, str(limit)) or {}
-        models = {key: model for key, model in list_models(paths.preset, name, seeds).items()
-                  if get(there, key, "run", "model") != model.name}  # fmt: skip
+        place = name, str(limit)
+        models = list_missing(list_models(paths.preset, name, seeds), file, place)
         folders = [render_limited(paths, name, turn) for turn in (limit, LIMITS_DEG[-1])] if models else []
-        work = partial(_measure, paths=paths, limit=limit, folders=folders)
-        for key, row in run_each(work, models, desc=f"{name} {say_limit(limit)}"):
-            rows = read_results(file, depth=3)
-            rows.setdefault(name, {}).setdefault(str(limit), {})[key] = row
-            write_results(rows, file)
+        ask = partial(_measure, paths=paths, limit=limit, folders=folders)
+        measure_each(models, file, place, ask, desc=f"{name} {say_limit(limit)}")
     save_figure(plot_limits(read_results(file, depth=3)), paths.figures / "pose_range")
     return file
 
@@ -91,12 +85,10 @@ def _measure(
     model: TrainConfig, *, paths: Paths, limit: int, folders: Sequence[Path], progress: bool
 ) -> dict[str, Any]:  # fmt: skip
     """The row of a model that is trained on the first of the ``folders`` and asked about both."""
-    name, place = f"{model.name}-within-{limit}", paths.generated / "pose_range"
-    weights = train_model(model, folders[0], place / "models" / name, progress=progress)
-    questions, queries = load_preset(paths.preset).evaluate, place / "queries"
-    tables = {where: evaluate_model(weights, images, questions, queries / f"{name}-{where}.parquet", progress=progress)
-              for where, images in zip(("within", "any"), folders, strict=True)}  # fmt: skip
-    return summarise(tables) | {"run": describe_run(weights)}
+    return train_and_measure(
+        model, paths=paths, place=paths.generated / "pose_range", name=f"{model.name}-within-{limit}",
+        images=folders[0], asked=dict(zip(("within", "any"), folders, strict=True)), progress=progress,
+    )  # fmt: skip
 
 
 def _list_objects(objects: str | Sequence[str]) -> list[str]:

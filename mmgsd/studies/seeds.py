@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import statistics
+from collections.abc import Mapping
 from functools import partial
+from typing import Any
 
 from scipy import stats
 
@@ -25,30 +27,36 @@ def list_seeds(rows: Results, method: str) -> list[float]:
 def describe_seeds(results: Results) -> Table:
     """The mean and the std of the RMSE over seeds, from {object: {"mmgsd-0": errors}}, a method a row.
 
-    Marked where it differs from MMGSD's by `compare_seeds`: by an asterisk, or by a dagger where it did before Holm's
-    correction alone.
+    Marked (`say_tested`) where it differs from MMGSD's.
     """
     tested = compare_seeds(results)
-
-    def say(name: str, method: str) -> str | None:
-        """Mean and spread over the seeds, and whether tests tell it from MMGSD's."""
-        said, (alone, corrected) = say_seeds(results.get(name, {}), method), tested.get((name, method), (1.0, 1.0))
-        return f"{said}{' *' if corrected < LEVEL else ' †' if alone < LEVEL else ''}" if said else None
-
-    seeds = {label: {name: say(name, method) for name in OBJECTS} for method, label in LABELS.items()}
+    seeds = {label: {name: say_tested(results, tested, name, method) for name in OBJECTS}
+             for method, label in LABELS.items()}  # fmt: skip
     return describe_objects("RMSE px: mean ± std (seeds)", {k: row for k, row in seeds.items() if any(row.values())})
 
 
-def compare_seeds(results: Results) -> dict[tuple[str, str], tuple[float, float]]:
-    """{(object, method): p of Welch's t-test against MMGSD's seeds, alone and by Holm's correction for all of them}.
+Tested = Mapping[tuple[Any, str], tuple[float, float]]  # as `compare_seeds` has it
 
+
+def say_tested(results: Mapping[Any, Results], tested: Tested, name: Any, method: str) -> str | None:
+    """`say_seeds` of one part of the results, with an asterisk where p < `LEVEL`, a dagger where only without Holm."""
+    said, (alone, corrected) = say_seeds(results.get(name, {}), method), tested.get((name, method), (1.0, 1.0))
+    return f"{said}{' *' if corrected < LEVEL else ' †' if alone < LEVEL else ''}" if said else None
+
+
+def compare_seeds(results: Mapping[Any, Results], others: Mapping[str, str] | None = None) -> Tested:
+    """{(part, method): p of Welch's t-test against MMGSD's seeds, alone and by Holm's correction for all of them}.
+
+    ``results`` are {part: {"mmgsd-0": errors}}, ``others`` {method: what it is tested against} instead of MMGSD.
     Holm, "A simple sequentially rejective multiple test procedure" (1979). Of methods with two seeds or more.
     """
     alone = {}
     for name, rows in results.items():
-        ours, methods = list_seeds(rows, "mmgsd"), dict.fromkeys(key.rpartition("-")[0] for key in rows)
-        for method in (m for m in methods if m != "mmgsd" and min(len(ours), len(list_seeds(rows, m))) > 1):
-            alone[name, method] = float(stats.ttest_ind(list_seeds(rows, method), ours, equal_var=False).pvalue)
+        for method in dict.fromkeys(key.rpartition("-")[0] for key in rows):
+            other = "mmgsd" if others is None else others.get(method, method)
+            ours, theirs = list_seeds(rows, method), list_seeds(rows, other)
+            if method != other and min(len(ours), len(theirs)) > 1:
+                alone[name, method] = float(stats.ttest_ind(ours, theirs, equal_var=False).pvalue)
     corrected, least = {}, 0.0
     for k, (key, p) in enumerate(sorted(alone.items(), key=lambda item: item[1])):
         least = corrected[key] = max(least, min(1.0, (len(alone) - k) * p))

@@ -3,7 +3,7 @@
     python -m mmgsd run shipped cloth cloth-paper orb --photographs FOLDER    -> data/results/shipped.json
     python -m mmgsd run shipped cloth@1,1 --photographs FOLDER     its modes read with another power and sharpness
     python -m mmgsd run shipped cloth@1,1,0 …      and what it is asked with not shrunk towards places
-    python -m mmgsd run shipped robustness --photographs FOLDER    the models of that study, once they are trained
+    python -m mmgsd run shipped backbones --photographs FOLDER     the models of that study, once they are trained
     python -m mmgsd run shipped cloth --cloth-renders FOLDER       and others' renders of a cloth
 
 A row a name: of weights in data/weights; of a baseline, which is asked about each object with the true masks, and in
@@ -38,7 +38,7 @@ from mmgsd.studies.models import PAPER, SHIPPED, configure_study, get_label
 from mmgsd.studies.registry import Shown, Study
 from mmgsd.studies.table import ERRORS, MISSING, Table, make_page_table, say_value
 
-STUDIES = ("robustness", "backbones")
+STUDIES = ("backbones",)
 RESULTS = "shipped.json"
 NAMES = ", ".join((*BASELINES, *OPTIONAL, *STUDIES))  # that may be measured besides weights
 Rows = Mapping[str, Mapping[str, Any]]  # data/results/shipped.json, {name: what `mmgsd.measure.shipped` found}
