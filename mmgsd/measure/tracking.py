@@ -13,6 +13,7 @@ import numpy as np
 
 RESIZED_PX = 256
 THRESHOLDS_PX = (1, 2, 4, 8, 16)  # of a resized frame
+APART_PX = THRESHOLDS_PX[-1]  # points nearer to each other cannot be told apart by where an answer lies
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,13 +30,16 @@ def measure_track(xy: np.ndarray, visible: np.ndarray, truth: Truth) -> dict[str
     """Shares of points in frames after the first one, of positions (T, S, 2) px and ``visible`` (T, S) bool.
 
     ``delta@1px`` … and their mean ``delta``, positions as near as that; ``swaps``, positions nearer to a like point's
-    truth than to their own; ``occlusion``, points of which it is rightly said whether they are seen; ``jaccard``, the
-    mean over thresholds of points rightly said to be there, of these and all errors. A position that is NaN is far from
-    all.
+    truth than to their own, where these lie more than `APART_PX` apart, of points of which some like one does (a fold
+    lays like points upon each other); ``occlusion``, points of which it is rightly said whether they are seen;
+    ``jaccard``, the mean over thresholds of points rightly said to be there, of these and all errors. A position that
+    is NaN is far from all.
     """
     scale = RESIZED_PX / np.array(truth.size)
     own = _measure_distance(xy, truth.xy, scale)[1:]  # (T - 1, S)
-    like = _measure_distance(xy[:, None], truth.likes, scale)[1:].min(1, initial=np.inf)
+    apart = _measure_distance(truth.xy[:, None], truth.likes, scale)[1:] > APART_PX  # (T - 1, G, S)
+    like = _measure_distance(xy[:, None], truth.likes, scale)[1:]
+    swapped, could = (apart & (like < own[:, None])).any(1), apart.any(1)
     seen, said = truth.visible[1:], np.asarray(visible, bool)[1:]
     near = own[..., None] <= THRESHOLDS_PX  # (T - 1, S, thresholds)
     right = (near & (seen & said)[..., None]).sum((0, 1))
@@ -44,7 +48,7 @@ def measure_track(xy: np.ndarray, visible: np.ndarray, truth: Truth) -> dict[str
     return {
         **{f"delta@{t}px": float(delta) for t, delta in zip(THRESHOLDS_PX, deltas, strict=True)},
         "delta": float(deltas.mean()),
-        "swaps": float((like < own)[seen].mean()) if seen.any() else float("nan"),
+        "swaps": float(swapped[seen & could].mean()) if (seen & could).any() else float("nan"),
         "occlusion": float((seen == said).mean()),
         "jaccard": float(np.mean(right / np.maximum(seen.sum() + wrong, 1))),
     }

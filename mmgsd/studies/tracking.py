@@ -39,7 +39,7 @@ from mmgsd.studies.registry import Results, Shown, Study
 from mmgsd.studies.table import Column, Table
 from mmgsd.symmetry import load_group
 
-VERSION = 1  # to be raised where a method answers the same film otherwise than before
+VERSION = 2  # to be raised where a method answers the same film otherwise than before
 FILMS = {"smoke": 1, "quick": 8, "paper": 30}  # of each object
 FRAMES, SCALE = 32, 1.0  # of a film; of its sides, by those of a rendered data set's image
 POINTS = {"cloth": [25 * r + c for r in range(0, 25, 6) for c in range(0, 25, 6)],
@@ -175,17 +175,17 @@ def make_films(object: str, bench: Bench, count: int, frames: int, scale: float)
 
 
 def measure_film(name: str, file: Path, out: Path) -> dict[str, float]:
-    """What `measure_track` says of a method's answer about a film, kept in ``out`` and not asked for again."""
+    """What `measure_track` says of a method's answer about a film, which is kept in ``out`` and not asked for again."""
     film, method = read_state(file), METHODS[name]
     weights = find_weights(film.about["object"]).read_bytes() if method.learnt else b""
     mark = {"film": film.about["mark"], "weights": hashlib.sha256(weights).hexdigest(), "version": VERSION}
-    kept = read_kept(out, mark)
+    kept, (points, truth) = read_kept(out, mark), find_truth(film)
     if kept is None:
-        points, truth = find_truth(film)
         xy, seen = method.follow(film.about["object"], film.image, film.xy[0, points])
-        kept = {"mark": mark, "measured": measure_track(np.asarray(xy, float), seen, truth)}
+        places = np.where(np.isfinite(xy), np.round(np.asarray(xy, float), 2), None)
+        kept = {"mark": mark, "xy": places.tolist(), "visible": np.asarray(seen, bool).tolist()}
         write_json(out, kept)
-    return kept["measured"]
+    return measure_track(np.array(kept["xy"], float), np.array(kept["visible"]), truth)
 
 
 def find_truth(film: State) -> tuple[np.ndarray, Truth]:
@@ -216,7 +216,7 @@ def make_films_sentence(results: Results) -> str:
     counts = [f"{results['methods'][object]['track']['all']['films']} films of a {object}" for object in OBJECTS]
     return (f"{' and '.join(counts)}, {results['run']['frames']} frames each: folds, half turns, grippers in front, a "
             "hand across. δ_avg, occlusion accuracy and average Jaccard are TAP-Vid's, at 256 × 256 px; a swap is a "
-            "point nearer to a like point's true place than to its own.")  # fmt: skip
+            "point nearer to a like point's true place than to its own, where those are more than 16 px apart.")
 
 
 @styled

@@ -94,24 +94,24 @@ def test_a_baseline_is_told_where_the_object_is_seen() -> None:
 
 
 def test_a_study_that_is_not_trained_says_how_to_train_it(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(FileNotFoundError, match="run python -m mmgsd run models paper --study robustness"):
-        main("robustness")
+    with pytest.raises(FileNotFoundError, match="run python -m mmgsd run models paper --study backbones"):
+        main("backbones")
     monkeypatch.setattr(study, "load_preset", load_preset)
-    with pytest.raises(FileNotFoundError, match="models quick --study robustness --steps 7"):
-        main("robustness", preset="quick", steps=7)
+    with pytest.raises(FileNotFoundError, match="models quick --study backbones --steps 7"):
+        main("backbones", preset="quick", steps=7)
 
 
 def test_a_study_of_another_preset_is_asked_about_its_own_images(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     quick, asked = load_preset("quick"), []
-    for model in configure_study(quick, "cloth", "robustness", steps=7).values():
+    for model in configure_study(quick, "cloth", "backbones", steps=7).values():
         folder = Paths(root, "quick").model(model)
         folder.mkdir(parents=True)
         shutil.copy(root / "w.safetensors", folder / "weights.safetensors")
     monkeypatch.setattr(study, "measure_weights", lambda name, root, **how: asked.append(how["presets"]) or {})
-    rows = measure_study("robustness", root, quick, steps=7)
-    assert list(rows) == [f"cloth-{name}" for name in ("mmgsd", "mmgsd_workspace", "mmgsd_clutter", "mmgsd_heads")]
+    rows = measure_study("backbones", root, quick, objects=["cloth"], steps=7)
+    assert list(rows) == ["cloth-light", "cloth-dinov2s"]
     assert set(asked) == {("quick", "workspace_quick")}
-    assert rows["cloth-mmgsd"] == {"preset": "quick", "steps": 7}
+    assert rows["cloth-light"] == {"preset": "quick", "steps": 7}
 
 
 def test_a_name_may_say_how_modes_are_read(root: Path) -> None:

@@ -51,7 +51,17 @@ def test_a_point_that_takes_its_like_ones_place_is_swapped() -> None:
 def test_what_has_no_like_points_cannot_swap() -> None:
     truth = make_truth()
     alone = Truth(truth.xy, truth.visible, truth.likes[:, :0], SIZE)
-    assert measure_track(truth.xy + 100, truth.visible, alone)["swaps"] == 0
+    assert np.isnan(measure_track(truth.xy + 100, truth.visible, alone)["swaps"])
+
+
+def test_points_that_a_fold_lays_upon_their_like_ones_are_no_swaps() -> None:
+    truth = make_truth()
+    truth.likes[2] = truth.xy[2] + (20, 0)  # 10 px resized
+    xy = truth.xy + (15, 0)
+    xy[1, 0] += (100, 0)
+    assert measure_track(xy, truth.visible, truth)["swaps"] == 1 / 4  # the last frame does not count
+    truth.likes[:] = truth.xy[:, None]
+    assert np.isnan(measure_track(xy, truth.visible, truth)["swaps"])
 
 
 def test_sequences_weigh_alike_and_what_one_has_not_does_not_count() -> None:

@@ -29,6 +29,7 @@ from mmgsd.studies.models import (
     vary_seed,
     vary_sigma,
 )
+from mmgsd.studies.robustness import STEPS, list_models
 
 ROOT = find_root(Path(__file__).parent)
 PAPER = load_preset("paper")
@@ -65,6 +66,8 @@ def list_stored(preset: str) -> dict[str, str]:
 def find_row(preset: str, key: str) -> TrainConfig:
     file, object, name = key.split("/")
     study, _, steps = file.partition("_")
+    if study == "robustness":
+        return list_models(preset, object, int(name[-1]) + 1, STEPS)[name]
     varied = {"sigma": lambda: vary_sigma([float(name)]), "seeds": lambda: vary_seed([int(name[-1])])}
     rows = varied[study]() if study in varied else None
     study = "main" if study == "runs" else study
@@ -82,7 +85,7 @@ def test_models_whose_results_are_kept_keep_their_names(preset: str, key: str, n
 def test_every_file_of_results_with_models_is_looked_at() -> None:
     files = {f"{preset}/{key.split('/')[0]}" for preset, key, _ in STORED}
     paper = ("runs", "budget", "sigma", "sigma_4000", "seeds_1000", "backbones_1500")
-    quick = ("runs", "sigma", "seeds", "robustness_300")
+    quick = ("runs", "sigma", "seeds", "robustness")
     assert files == {f"paper/{name}" for name in paper} | {f"quick/{name}" for name in quick}
 
 
@@ -106,7 +109,8 @@ def test_every_row_comes_to_a_training_of_its_objects(preset: str) -> None:
 def test_names_are_unique_and_starts_are_rows() -> None:
     assert len(ROWS) == len(MODELS) + len(UNTRAINED)
     assert {row.start for row in MODELS} <= {PRESET, *ROWS}
-    assert {study for row in MODELS for study in row.studies} | {"sigma"} == {*STUDIES, "fixes", "rounds", "seeds"}
+    others = {"fixes", "robustness", "rounds", "seeds"}
+    assert {study for row in MODELS for study in row.studies} | {"sigma"} == {*STUDIES, *others}
 
 
 def test_everything_that_a_figure_may_draw_has_a_colour_of_its_own() -> None:
@@ -157,7 +161,7 @@ def test_a_fix_has_images_of_its_own() -> None:
 
 def test_models_that_need_other_images_are_run_where_they_are_asked_for() -> None:
     assert not any(model.also for model in [*list_runs(PAPER), *list_runs(PAPER, ["main"])])
-    assert len(list_runs(PAPER, ["robustness"])) == 8 and STUDIES[: len(RUN)] == RUN
+    assert len(list_runs(PAPER, ["backbones"])) == 4 and STUDIES[: len(RUN)] == RUN
 
 
 def test_an_unknown_model_is_refused_by_name() -> None:

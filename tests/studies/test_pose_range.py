@@ -83,7 +83,7 @@ def test_run_trains_within_each_limit_asks_both_and_goes_on(tmp_path, tiny_datas
         return actual(model, images, folder, progress=False)
 
     monkeypatch.setattr(pose_range, "render_dataset", render)
-    monkeypatch.setattr(pose_range, "train_model", partial(train, pose_range.train_model))
+    monkeypatch.setattr(matrix, "train_model", partial(train, matrix.train_model))
     monkeypatch.setattr(matrix, "PROCESSES", 1)  # other processes would not see what is replaced here
     monkeypatch.setattr(pose_range, "LIMITS_DEG", (15, 180))
     monkeypatch.setattr(pose_range, "METHODS", ("mmgsd", "unimodal"))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from mmgsd.studies.robustness import describe_parts, make_budget_sentence
 from mmgsd.studies.shipped import (
     describe_cloth_renders,
     describe_knowledge,
@@ -71,16 +70,6 @@ def test_others_renders_are_beside_what_the_paper_says_of_its_own() -> None:
     assert lines[2] == "| `cloth` | 31.7 | 27.7 | 35 % |" and "32.4" in lines[3] and len(lines) == 4
 
 
-def test_parts_are_told_one_after_another() -> None:
-    rows = {"rope-mmgsd_heads": {"paper": SET}, "rope-mmgsd": {"paper": SET, "workspace": {"rmse_mean": 99.0}}}
-    lines = to_markdown(describe_parts(rows | ROWS)).splitlines()
-    assert [line.partition(" | ")[0] for line in lines[2:]] == [
-        "| rope, **MMGSD** (ours)",
-        "| rope, the same, with heads",
-    ]
-    assert lines[2].endswith("| 21.0 | 99.0 |")  # of photographs nothing was measured
-
-
 OWN = "| cloth, `cloth`, power 1.5, sharpness 4"
 
 
@@ -98,12 +87,6 @@ def test_ways_of_reading_stand_beside_the_weights_own() -> None:
         "| cloth, `cloth`, power 1, sharpness 1 | 25.6 | – | – | – | – | – |",
         f"{OWN}, shrinkage 0 | 23.0 | – | – | – | – | – |",
     ]
-
-
-def test_the_parts_budget_is_said() -> None:
-    rows = ROWS | {"cloth-mmgsd": {"preset": "quick", "steps": 300}}
-    said = "Preset `quick`: 300 steps each, from 300 images of a kind; 50 test images of each."
-    assert make_budget_sentence(rows) == said
 
 
 def test_knowledge_is_of_weights_alone() -> None:
