@@ -33,6 +33,9 @@ PIP := env -u PYTHONDONTWRITEBYTECODE $(PY) -m pip --disable-pip-version-check i
 STAMP := .venv/.installed
 SITE := .venv/docs
 PYTEST := OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(PY) -m pytest --numprocesses $(JOBS) --dist loadfile --no-loadscope-reorder
+# run_all would run every notebook a second time: a test in tests/ runs it through papermill.
+NOTEBOOKS := --nbval --nbval-current-env --nbval-cell-timeout=600 --nbval-sanitize-with=tests/nbval_sanitize.cfg \
+	$(wildcard notebooks/[01]*.ipynb) notebooks/explore.ipynb $(wildcard notebooks/your_*.ipynb)
 PAPERMILL := $(PY) -m papermill --kernel python3
 
 .PHONY: help .venv reproduce smoke test lint unit notebooks-test figures paper readme docs weights data-sample \
@@ -47,7 +50,8 @@ reproduce: $(STAMP) ## Run the whole experiment, preset quick: render, train, ev
 smoke: $(STAMP) ## The same with the preset smoke: every stage, tiny
 	$(PY) -m mmgsd reproduce smoke
 
-test: lint unit notebooks-test ## Every check: lint, unit and notebooks-test
+test: lint ## Every check: lint, and in one run what unit and notebooks-test run
+	$(PYTEST) tests $(NOTEBOOKS)
 
 lint: $(STAMP) ## Check the style with ruff
 	$(PY) -m ruff check .
@@ -55,10 +59,8 @@ lint: $(STAMP) ## Check the style with ruff
 unit: $(STAMP) ## Run the tests in tests/
 	$(PYTEST) tests
 
-# run_all would run every notebook a second time: a test in tests/ runs it through papermill.
 notebooks-test: $(STAMP) ## Run the notebooks and compare their outputs with the committed ones
-	$(PYTEST) --nbval --nbval-current-env --nbval-cell-timeout=600 \
-		--nbval-sanitize-with=tests/nbval_sanitize.cfg notebooks/[01]*.ipynb notebooks/explore.ipynb notebooks/your_*.ipynb
+	$(PYTEST) $(NOTEBOOKS)
 
 figures: $(STAMP) ## Draw the paper's figures of PRESET (paper) again from data/results, without training
 	@mkdir -p data/generated

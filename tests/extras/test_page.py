@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,22 @@ PHONE = {"width": 390, "height": 844}
 @pytest.fixture(scope="module")
 def matcher() -> Matcher:
     return mmgsd.load("cloth", device="cpu")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def exported_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """All pages here are of the same weights, and one network's file: writing it takes longest."""
+    written, actual = tmp_path_factory.mktemp("network"), page_module.export_onnx
+
+    def export(matcher: Matcher, path: Path, *, half: bool = False) -> None:
+        file = written / f"{half}.onnx"
+        if not file.is_file():
+            actual(matcher, file, half=half)
+        shutil.copy(file, path)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(page_module, "export_onnx", export)
+        yield
 
 
 @pytest.fixture(scope="module")
