@@ -22,11 +22,12 @@ class Following:
     """Follows two points: the second is hidden, then the object is away, in the last frame."""
 
     error: BaseException | None = None
+    fails_at = 2
     absent = (0.0, 0.0, 0.9)
 
     def follow(self, frames: object, xy: object = None, *, find: object = None, mask0: object = None) -> Iterator:
         for number, frame in enumerate(frames):
-            if number == 2 and self.error:
+            if number == self.fails_at and self.error:
                 raise self.error
             away = self.absent[number] > 0.5
             places = np.full((2, 2), np.nan) if away else np.array([[10.0, 20], [40, 30.25]]) + number
@@ -120,3 +121,11 @@ def test_seen_points_are_filled_and_hidden_ones_rings() -> None:
     points = Tracked(np.array([[50.0, 50], [150, 150], [np.nan, np.nan]]), np.array([0.9, 0.1, 0]), np.ones(3), 0.0)
     drawn = draw_points(image, points)
     assert drawn[50, 50].any() and not drawn[150, 150].any() and drawn[140:160, 140:160].any() and not image.any()
+
+
+def test_a_folder_that_was_made_for_nothing_goes_again(following, frames: Path, tmp_path: Path) -> None:
+    following.error = RuntimeError("nothing is followed")
+    following.fails_at = 0
+    with pytest.raises(SystemExit):
+        track(frames, tmp_path / "out")
+    assert not (tmp_path / "out").exists()

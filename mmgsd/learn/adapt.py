@@ -112,10 +112,10 @@ def adapt(
         return out
     work = out.with_name(f"{out.stem}.adapting")
     with files.locked(work, "adapting"), repeatable(start.device):
+        job = _Job(start, photographs, _load_renders(kind, renders), work, asked, progress)
         if (work / ASKED).is_file() and files.read_json(work / ASKED) != asked:
             files.remove_folder(work, _is_ours)
         files.write_json(work / ASKED, asked)
-        job = _Job(start, photographs, _load_renders(kind, renders), work, asked, progress)
         with files.saying_what_stays(lambda: f"what was learnt is kept in {work}: the same call goes on"):
             found = job.measure()
             job.finish(out, source, found)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +39,8 @@ def list_outputs(out: Path) -> list[Path]:
 def recording(paths: list[Path], rate: float) -> Iterator[Record]:
     """Give what takes frames and their answers; at the end each file is there whole, after an exception none."""
     with ExitStack() as stack:
+        for folder in {path.parent for path in paths if not path.parent.exists()}:
+            stack.callback(_remove_empty, folder)
         writers = [stack.enter_context(WRITERS.get(path.suffix.lower(), _draw)(path, rate)) for path in paths]
         number = iter(range(2**62))
 
@@ -49,6 +51,11 @@ def recording(paths: list[Path], rate: float) -> Iterator[Record]:
                 write(at, image, tracked)
 
         yield record
+
+
+def _remove_empty(folder: Path) -> None:
+    with suppress(OSError):  # it holds files, or was never made
+        folder.rmdir()
 
 
 @contextmanager
