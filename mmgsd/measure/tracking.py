@@ -30,16 +30,17 @@ def measure_track(xy: np.ndarray, visible: np.ndarray, truth: Truth) -> dict[str
     """Shares of points in frames after the first one, of positions (T, S, 2) px and ``visible`` (T, S) bool.
 
     ``delta@1px`` … and their mean ``delta``, positions as near as that; ``swaps``, positions nearer to a like point's
-    truth than to their own, where these lie more than `APART_PX` apart, of points of which some like one does (a fold
-    lays like points upon each other); ``occlusion``, points of which it is rightly said whether they are seen;
-    ``jaccard``, the mean over thresholds of points rightly said to be there, of these and all errors. A position that
-    is NaN is far from all.
+    truth than to their own; ``taken``, positions within `APART_PX` of a like point's truth and not of their own;
+    ``occlusion``, points of which it is rightly said whether they are seen; ``jaccard``, the mean over thresholds of
+    points rightly said to be there, of these and all errors. A position that is NaN is far from all. For swaps count
+    like points more than `APART_PX` apart, of points that have some: a fold lays like ones upon each other.
     """
     scale = RESIZED_PX / np.array(truth.size)
     own = _measure_distance(xy, truth.xy, scale)[1:]  # (T - 1, S)
     apart = _measure_distance(truth.xy[:, None], truth.likes, scale)[1:] > APART_PX  # (T - 1, G, S)
     like = _measure_distance(xy[:, None], truth.likes, scale)[1:]
     swapped, could = (apart & (like < own[:, None])).any(1), apart.any(1)
+    taken = (apart & (like <= APART_PX) & (own > APART_PX)[:, None]).any(1)
     seen, said = truth.visible[1:], np.asarray(visible, bool)[1:]
     near = own[..., None] <= THRESHOLDS_PX  # (T - 1, S, thresholds)
     right = (near & (seen & said)[..., None]).sum((0, 1))
@@ -48,10 +49,15 @@ def measure_track(xy: np.ndarray, visible: np.ndarray, truth: Truth) -> dict[str
     return {
         **{f"delta@{t}px": float(delta) for t, delta in zip(THRESHOLDS_PX, deltas, strict=True)},
         "delta": float(deltas.mean()),
-        "swaps": float(swapped[seen & could].mean()) if (seen & could).any() else float("nan"),
+        "swaps": _average(swapped[seen & could]),
+        "taken": _average(taken[seen & could]),
         "occlusion": float((seen == said).mean()),
         "jaccard": float(np.mean(right / np.maximum(seen.sum() + wrong, 1))),
     }
+
+
+def _average(chosen: np.ndarray) -> float:
+    return float(chosen.mean()) if len(chosen) else float("nan")
 
 
 def _measure_distance(xy: np.ndarray, true: np.ndarray, scale: np.ndarray) -> np.ndarray:

@@ -45,8 +45,8 @@ FRAMES, SCALE = 32, 1.0  # of a film; of its sides, by those of a rendered data 
 POINTS = {"cloth": [25 * r + c for r in range(0, 25, 6) for c in range(0, 25, 6)],
           "rope": list(range(0, 625, 26))}  # fmt: skip
 CONSISTENT_PX = 2.0  # a point that flow takes there and back to so near is seen
-COLUMNS = [Column("delta", page="δ_avg", scale=100), Column("swaps", page="swaps", scale=100),
-           Column("occlusion", page="occlusion", scale=100), Column("jaccard", page="Jaccard", scale=100)]  # fmt: skip
+HEADS = {"delta": "δ_avg", "swaps": "swaps", "taken": "at a like point", "occlusion": "occlusion", "jaccard": "Jaccard"}
+COLUMNS = [Column(key, page=head, scale=100) for key, head in HEADS.items()]
 
 Answer = tuple[np.ndarray, np.ndarray]  # (T, S, 2) px, and (T, S) bool, whether the point is seen
 Follow = Callable[[str, np.ndarray, np.ndarray], Answer]  # of an object's frames (T, H, W, 3) and first pixels (S, 2)
@@ -205,7 +205,7 @@ def summarise(measured: Mapping[str, dict[str, float]]) -> dict[str, dict[str, f
 
 
 def describe_tracking(results: Results) -> Table:
-    """δ_avg, identity swaps, occlusion accuracy and average Jaccard of each method, on both objects."""
+    """The measures of `HEADS` of each method, an object below the other."""
     rows = {method.label: {object: results["methods"][object][name]["all"] for object in OBJECTS}
             for name, method in METHODS.items()}  # fmt: skip
     return Table(" ", {"": COLUMNS}, rows, OBJECTS)
@@ -216,7 +216,8 @@ def make_films_sentence(results: Results) -> str:
     counts = [f"{results['methods'][object]['track']['all']['films']} films of a {object}" for object in OBJECTS]
     return (f"{' and '.join(counts)}, {results['run']['frames']} frames each: folds, half turns, grippers in front, a "
             "hand across. δ_avg, occlusion accuracy and average Jaccard are TAP-Vid's, at 256 × 256 px; a swap is a "
-            "point nearer to a like point's true place than to its own, where those are more than 16 px apart.")
+            "point nearer to a like point's true place than to its own, where those are more than 16 px apart; "
+            "at a like point it is within 16 px of that one and not of its own.")
 
 
 @styled

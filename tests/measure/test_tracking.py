@@ -46,6 +46,9 @@ def test_a_point_that_takes_its_like_ones_place_is_swapped() -> None:
     xy[2, 2] = np.nan
     measured = measure_track(xy, np.isfinite(xy).all(-1), truth)
     assert measured["swaps"] == 2 / 8 and measured["delta@1px"] == 4 / 8
+    assert measured["taken"] == 0  # half-way to the like point is at neither
+    xy[1:, 0] += (70, 0)
+    assert measure_track(xy, np.isfinite(xy).all(-1), truth)["taken"] == 2 / 8
 
 
 def test_what_has_no_like_points_cannot_swap() -> None:
