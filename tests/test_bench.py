@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from browser import CHROMIUM
-from conftest import write_tiny_dataset
+from synthetic import write_tiny_dataset
 
 from mmgsd.config import OBJECTS, load_preset
 from mmgsd.learn.training import train_model
