@@ -238,14 +238,6 @@ def describe_rounds(rounds: Rows) -> Table:
     return make_page_table(ROUND_HEADS, lines)
 
 
-def make_sources_sentence(rows: Rows) -> str:
-    """What is counted in photographs, and which public repositories they are from."""
-    sources = dict.fromkeys(name for object in OBJECTS for name in rows[object]["photographs"]["sources"])
-    return ("The photographs, counted as on the\n"
-            "[results page](data/results/shipped.md#is-it-right-about-clutter-and-photographs), are from "
-            f"{', '.join(f'`{name}`' for name in sources)}.")  # fmt: skip
-
-
 def describe_sources(rows: Rows) -> Table:
     """The photographs of each public repository, a row each: what the shipped weights find in them."""
     lines = {}
@@ -342,7 +334,6 @@ STUDY = Study(
         "pictures": Shown(RESULTS, describe_pictures),
         "readings": Shown(RESULTS, describe_readings),
         "knowledge": Shown(RESULTS, describe_knowledge),
-        "sources": Shown(RESULTS, make_sources_sentence),
         "rounds": Shown("rounds.json", describe_rounds),
         "by_source": Shown(RESULTS, describe_sources),
         "counts": Shown(RESULTS, make_counts_sentence),

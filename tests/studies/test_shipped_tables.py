@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from mmgsd.studies.backbones import describe_backbones
 from mmgsd.studies.shipped import (
     describe_cloth_renders,
     describe_knowledge,
@@ -13,7 +14,6 @@ from mmgsd.studies.shipped import (
     list_names,
     make_counts_sentence,
     make_reading_sentence,
-    make_sources_sentence,
 )
 from mmgsd.studies.table import to_markdown
 
@@ -95,8 +95,7 @@ def test_knowledge_is_of_weights_alone() -> None:
     assert not any("orb" in line.lower() for line in lines)
 
 
-def test_sentences_name_the_sources_and_count_the_photographs() -> None:
-    assert make_sources_sentence(ROWS).endswith("are from `a/b`, `c/d`.")
+def test_a_sentence_counts_the_photographs() -> None:
     said = "Photographs: 34 of cloths and 32 of ropes. One question about two new images takes 140 ms (CPU, 2 cores)."
     assert make_counts_sentence(ROWS) == said
 
@@ -129,3 +128,11 @@ def test_limits_are_in_px_shares_of_the_side_and_milliseconds() -> None:
     assert "140 ms" in lines[8] and "never tried" in lines[9]
     unsized = ROWS | {"cloth": {key: value for key, value in ROWS["cloth"].items() if key != "side_px"}}
     assert "cloth 21 px, – of its side" in to_markdown(describe_limits(unsized))
+
+
+def test_trunks_stand_beside_each_other_with_their_time() -> None:
+    rows = ROWS | {"cloth-dinov2s": {"paper": SET, "milliseconds": 884.8}, "rope-light": {"workspace": SET}}
+    lines = to_markdown(describe_backbones(rows)).splitlines()
+    assert lines[0].endswith("| cluttered: RMSE px | ms a question |")
+    assert lines[2:] == ["| cloth, DINOv2 ViT-S/14, frozen | 21.0 | – | 885 |",
+                         "| rope, EfficientNet-Lite0, trained | – | 21.0 | – |"]  # fmt: skip
