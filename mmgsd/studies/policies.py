@@ -53,6 +53,7 @@ POLICIES = {
         Policy("mmgsd_paper", "MMGSD of clean images alone, modes that agree", "#B22222", "-paper", AGREE),
         Policy("spcl", "SPCL, modes that agree", "#0072B2", "-spcl", AGREE),
         Policy("sift", "SIFT, modes that agree", "#CC79A7", "sift", AGREE),
+        Policy("imagenet", "ImageNet features, modes that agree", "#117733", "imagenet", AGREE),
         *(Policy(f"quick_{name}", f"{label}, as `{TRAINED_BY}` trains it", get_colour(name), "", AGREE, name)
           for name, label in (("mmgsd", "MMGSD"), ("spcl", "SPCL"), ("unimodal", "Unimodal"), ("pcl", "PCL"))),
         Policy("quick_one", f"Unimodal, as `{TRAINED_BY}` trains it, one mode", get_colour("unimodal"), "", AGREE,
