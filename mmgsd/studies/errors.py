@@ -267,7 +267,7 @@ STUDY = Study(
     tables={"errors": Shown("paper/errors.json", describe_difficulties, "errors_table")},
     claims=(judge_hidden,),
     findings=(
-        Finding(6, "Hidden matches",
+        Finding(7, "Hidden matches",
                 " are a part of the cloth's error: queries without one have {seen} of the mean error.",
                 "where-is-the-error", count_findings),
     ),

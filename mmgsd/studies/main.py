@@ -335,7 +335,7 @@ STUDY = Study(
                 " helps little: told one, Unimodal has {unimodal} more error at most, after fewer steps {seeds}, which "
                 "three seeds {apart} from chance.",
                 "which-method-is-best", count_findings),
-        Finding(5, "More training", ", larger images and a deeper network take MMGSD to {deep}.",
+        Finding(6, "More training", ", larger images and a deeper network take MMGSD to {deep}.",
                 "does-more-training-help", count_findings),
     ),
     compared=ERROR_MEASURES,

@@ -110,3 +110,9 @@ def test_mean_loss_of_one_match_is_that_of_all():
     every = losses.compute_target(modes[None, None], torch.ones(1, 1, 4, dtype=torch.bool), xs, ys, 4.0)
     mean = torch.stack([losses.mmgsd(squared, one) for one in ones]).mean()
     torch.testing.assert_close(mean, losses.mmgsd(squared, every))
+
+
+def test_the_finding_tells_both_objects_and_what_was_not_measured():
+    found = pose_range.count_findings(make_results(**CONJECTURE))
+    assert found == {"narrow": "49 % (cloth) and 49 % (rope)", "any": "2 % (cloth) and 2 % (rope)"}
+    assert pose_range.count_findings({}) == {"narrow": "not measured", "any": "not measured"}
