@@ -132,9 +132,19 @@ def _average(rows: pd.DataFrame, keys: list[str]) -> pd.DataFrame:
     return rows.groupby([*keys, "repository"])[[*COLUMNS, "grown"]].mean().groupby(keys).mean()
 
 
+def choose_largest(rows: pd.DataFrame) -> pd.DataFrame:
+    """The rows of those repositories of which most numbers of photographs were learnt from, of each object."""
+    counts = rows.groupby(["object", "repository"])["count"].nunique()
+    largest = counts[counts == counts.groupby("object").transform("max")].index
+    return rows[pd.MultiIndex.from_frame(rows[["object", "repository"]]).isin(largest)]
+
+
 def describe_adaptation(results: Results) -> Table:
-    """What is found and spurious by number of photographs, and how much renders' error grows."""
-    means = _average(tabulate(results), ["object", "kind", "count", "place", "by"])
+    """What is found and spurious by number of photographs, and how much renders' error grows, means over splits.
+
+    Of the largest repositories alone: all rows of an object are of the same photographs.
+    """
+    means = _average(choose_largest(tabulate(results)), ["object", "kind", "count", "place", "by"])
     ways, lines = [(place, by) for place in ASKED for by in ("name", "picture")], {}
     for (object, kind, count), part in means.groupby(level=[0, 1, 2], sort=False):
         label = f"{object}, {count} {KINDS[kind]}" if count else f"{object}, as shipped"

@@ -6,12 +6,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from mmgsd.measure.photographs import Photograph
 from mmgsd.paths import Paths
 from mmgsd.studies import adaptation
 from mmgsd.studies.adaptation import (
+    choose_largest,
     describe_adaptation,
     find_most,
     list_cells,
@@ -86,3 +88,10 @@ def test_what_is_measured_is_kept_and_told(
     (line,) = (line for line in axis.lines if line.get_label() == "with marks, by name")
     assert axis.get_title() == "cloth\nsome" and line.get_xydata().tolist() == [[0, 60], [2, 80]]
     assert (tmp_path / "figures" / "adaptation.png").is_file()
+
+
+def test_the_table_has_equal_photographs_in_all_rows_of_an_object() -> None:
+    rows = [("cloth", "large", 0), ("cloth", "large", 2), ("cloth", "large", 5), ("cloth", "small", 0),
+            ("cloth", "small", 2), ("rope", "only", 0), ("rope", "only", 2)]  # fmt: skip
+    kept = choose_largest(pd.DataFrame(rows, columns=["object", "repository", "count"]))
+    assert kept.repository.tolist() == ["large"] * 3 + ["only"] * 2
