@@ -116,7 +116,8 @@ def describe_limits(results: Results) -> Table:
     columns = [
         Column("rmse", "RMSE", "RMSE px", optional=True),
         Column("found", "≤20", "pck@20px", ".0f", scale=100, optional=True),
-        Column("p", "p", "p", ".3f", optional=True), Column("any", "all poses", "RMSE px, all poses", optional=True),
+        Column("p", "p", form=".3f", optional=True), Column("nearest", page="nearest match px", optional=True),
+        Column("any", "all poses", "RMSE px, all poses", optional=True),
     ]  # fmt: skip
     return Table("poses, method", {"": columns}, {label: row for label, row in lines.items() if row}, OBJECTS)
 
@@ -124,13 +125,14 @@ def describe_limits(results: Results) -> Table:
 def _describe_row(results: Results, object: str, limit: int, method: str) -> dict[str, Any]:
     within = get_rows(results, object, limit)
     every = None if limit == LIMITS_DEG[-1] else _mean(get_rows(results, object, limit, "any"), method)
-    return {"rmse": say_seeds(within, method), "found": _mean(within, method, "pck@20px"), "any": every}
+    found, nearest = (_mean(within, method, measure) for measure in ("pck@20px", "nearest_mean"))
+    return {"rmse": say_seeds(within, method), "found": found, "nearest": nearest, "any": every}
 
 
 def _mean(rows: Mapping[str, Results], method: str, measure: str = "rmse_mean") -> float | None:
     """The mean of a measure over a method's seeds; None of none."""
-    values = [row[measure] for key, row in rows.items() if key.rpartition("-")[0] == method]
-    return statistics.mean(values) if values else None
+    values = [row.get(measure) for key, row in rows.items() if key.rpartition("-")[0] == method]
+    return statistics.mean(values) if values and None not in values else None
 
 
 def say_limit(limit: int) -> str:
