@@ -163,7 +163,8 @@ def make_batch(
 ) -> Batch:
     """Augment the images ``indices`` (B,), labels with them, and move them to the device.
 
-    Half of them are mirrored where the object has a mirror image; with ``config.clutter`` they are also put together
+    Half of them are mirrored where the object has a mirror image, so that it keeps its heading where ``config.rotate``
+    is off; with ``config.clutter`` they are also put together
     anew (`mmgsd.learn.compositing`), with ``config.strong`` retextured (`mmgsd.learn.texturing`).
     """
     made = [_make_one(images, int(index), config, rng) for index in indices]
@@ -182,8 +183,7 @@ def _make_one(images: TrainingImages, index: int, config: TrainConfig, rng: np.r
         reach = {"scale": STRONG_SCALE, "shift": STRONG_SHIFT} if config.strong else {}
         warp = sample_warp(images.size, rng, rotate=config.rotate, bend=config.bend, **reach)
         if images.mirror is not None and rng.random() < 0.5:
-            mirror = [[-1, 0, images.size[0] - 1], [0, 1, 0], [0, 0, 1]]  # columns backwards
-            warp = dataclasses.replace(warp, affine=warp.affine @ mirror)
+            warp = dataclasses.replace(warp, affine=warp.affine @ _make_mirror(images, rotate=config.rotate))
             xy, visible = xy[images.mirror], visible[images.mirror]
     planes = [images.images[index], images.masks[index]]
     if config.strong:
@@ -201,6 +201,14 @@ def _make_one(images: TrainingImages, index: int, config: TrainConfig, rng: np.r
         visible = visible & ~_look_up(made.covered, xy, images.size) & present
     image = jitter_colours(image, rng) if config.augment else image
     return disturb(image, rng) if config.clutter else image, mask > 127, xy, visible, present
+
+
+def _make_mirror(images: TrainingImages, *, rotate: bool) -> np.ndarray:
+    """(3, 3) columns backwards, or rows where points keep their order, as a rope's, and it must not ``rotate``."""
+    (width, height), same = images.size, np.array_equal(images.mirror, np.arange(len(images.mirror)))
+    if same and not rotate:  # columns backwards turn it end for end
+        return np.array([[1, 0, 0], [0, -1, height - 1], [0, 0, 1]])
+    return np.array([[-1, 0, width - 1], [0, 1, 0], [0, 0, 1]])
 
 
 def _warp_once(

@@ -166,6 +166,20 @@ def test_labels_follow_a_mirrored_image(
     assert mirrored == ({0, 1} if object == "cloth" else {0})
 
 
+@pytest.mark.parametrize(("object", "last"), [("cloth", 24), ("rope", 624)])
+def test_a_mirror_image_is_not_turned_end_for_end_where_nothing_turns(
+    tiny_dataset: Callable[..., Path], rng: np.random.Generator, object: str, last: int
+) -> None:
+    images = load_training_images(load_dataset(tiny_dataset(object=object)), 64)
+    along = images.xy[:, last] - images.xy[:, 0]
+    index = int(np.abs(along[:, 0]).argmax())
+    config = dataclasses.replace(CONFIG, object=object, rotate=False, bend=0.0)
+    batch = make_batch(images, np.full(40, index), config, rng, torch.device("cpu"))
+    found = (batch.xy[:, last] - batch.xy[:, 0]).numpy()
+    assert (np.sign(found[:, 0]) == np.sign(along[index, 0])).all()
+    assert len(set(np.sign(found[:, 1]))) == 2  # some are mirrored
+
+
 def test_without_a_mirror_nothing_is_mirrored(tiny_dataset: Callable[..., Path], rng: np.random.Generator) -> None:
     images = dataclasses.replace(load_training_images(load_dataset(tiny_dataset()), 64), mirror=None)
     for _ in range(8):  # three corners of a cloth keep their sense of rotation
