@@ -81,20 +81,42 @@ def _join(xy: np.ndarray, modes: np.ndarray, weights: np.ndarray, spread: np.nda
     known = np.isfinite(modes).all(-1)
     if n < 2 or count < 3 or not known.all(1).any():
         return np.tile(np.arange(n), (count, 1))
-    middle = modes[known].mean(0)
-    extent = max(float(np.sqrt(np.mean(np.sum((modes[known] - middle) ** 2, -1)))), 1e-6)
-    values = np.where(known[..., None], (modes - middle) / extent, 0.0)
-    variance = np.where(known, (np.nan_to_num(spread) / extent) ** 2 + NOISE**2, 4.0)
+    values, variance, _, _ = _scale(modes, spread)
     log_weights = np.log(np.clip(np.nan_to_num(weights), 1e-3, None))
-    edges = _list_edges(xy, mask)
-    length = np.linalg.norm(xy[edges[:, 0]] - xy[edges[:, 1]], axis=1)
-    length = np.maximum(length, 1e-6) / max(float(np.sqrt(np.mean(np.sum((xy - xy.mean(0)) ** 2, -1)))), 1e-6)
+    edges, length = _measure_edges(xy, mask)
     kernel = _make_kernel(edges, length, count)
     ways = shortest_path(coo_matrix((length, edges.T), shape=(count, count)), directed=False)  # by the extent
     rivals = _find_rivals(ways, values, known)
     found = [_assign(kernel, rivals, values, variance, log_weights, start)
              for start in _choose_starts(values, variance, known)]  # fmt: skip
     return max(found, key=lambda outcome: outcome[1])[0]
+
+
+def predict(xy: np.ndarray, mask: np.ndarray, modes: np.ndarray, spread: np.ndarray) -> np.ndarray:
+    """Where the maps through sorted modes (S, n, 2) px take each pixel of ``xy``, by what all the others say.
+
+    Arguments are as `join` has them, modes in the order that it returns.
+    """
+    values, variance, middle, extent = _scale(modes, spread)
+    noise = np.where(np.isfinite(modes).all(-1), variance, UNKNOWN)
+    return _predict(_make_kernel(*_measure_edges(xy, mask), len(xy)), values, noise)[0] * extent + middle
+
+
+def _scale(modes: np.ndarray, spread: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Modes from their middle, and variances, both by the object's extent; that middle and extent (px)."""
+    known = np.isfinite(modes).all(-1)
+    middle = modes[known].mean(0)
+    extent = max(float(np.sqrt(np.mean(np.sum((modes[known] - middle) ** 2, -1)))), 1e-6)
+    values = np.where(known[..., None], (modes - middle) / extent, 0.0)
+    return values, np.where(known, (np.nan_to_num(spread) / extent) ** 2 + NOISE**2, 4.0), middle, extent
+
+
+def _measure_edges(xy: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs (E, 2) of near places, and how far apart they lie, by the object's extent."""
+    edges = _list_edges(xy, mask)
+    length = np.linalg.norm(xy[edges[:, 0]] - xy[edges[:, 1]], axis=1)
+    extent = max(float(np.sqrt(np.mean(np.sum((xy - xy.mean(0)) ** 2, -1)))), 1e-6)
+    return edges, np.maximum(length, 1e-6) / extent
 
 
 def _make_kernel(edges: np.ndarray, length: np.ndarray, count: int) -> np.ndarray:

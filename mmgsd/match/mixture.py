@@ -14,6 +14,7 @@ modes away from its peaks. `ModeReadout` says how far modes follow the peaks ins
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -45,14 +46,16 @@ ELLIPSE = 5.991  # squared Mahalanobis distance of the ellipse that holds 95 % o
 class ModeReadout:
     """How modes are read from a heatmap; ValueError, which names it, for another value.
 
-    ``shape_prior``: heatmap mass by which modes are a priori round and equally wide, greater than 0. ``exponent``,
-    at least 1: they are fitted to the heatmap raised to it. ``mean_exponent``, at least 1: each then lies at the mean
+    ``shape_prior``: heatmap mass by which modes are a priori round and equally wide, greater than 0; their common width
+    is the mean of theirs, or with ``median_width`` the median. ``exponent``, at least 1: they are fitted to the heatmap
+    raised to it. ``mean_exponent``, at least 1: each then lies at the mean
     of its share of the heatmap raised to it. Weights and covariances are those of the shares of the heatmap itself.
     """
 
     shape_prior: float = ROUNDNESS
     exponent: float = 1.0
     mean_exponent: float = 1.0
+    median_width: bool = False
 
     def __post_init__(self) -> None:
         check("shape_prior", self.shape_prior, "greater than 0", 0 < self.shape_prior < math.inf)
@@ -76,7 +79,7 @@ class Mixture:
 @own_numerics()
 def fit_modes(
     heatmap: Tensor, n: int | str | Tensor, xs: Tensor, ys: Tensor, *, readout: ModeReadout = AS_IT_IS,
-    merge: bool = False, start: Tensor | None = None,
+    merge: bool = False, start: Tensor | None = None, others: Sequence[Tensor] = (),
 ) -> Mixture:  # fmt: skip
     """Fit an n-modal Gaussian mixture to each heatmap by weighted expectation-maximisation.
 
@@ -85,8 +88,9 @@ def fit_modes(
     round and equally wide, the latter two as far as ``readout`` says: that decides which cell belongs to which mode,
     while the result holds the moments of the mass itself. With ``merge``, modes less than a cell apart are one, and
     the others absent. From ``start`` (S, N, 2) px, NaN where a query has no further mode, the fit goes on instead of
-    from the heatmap's peaks; ``n`` then does not count. Raises ValueError for ``n`` that is not from 1 to `MAX_MODES`,
-    another word, or values that are not finite.
+    from the heatmap's peaks; ``n`` then does not count. Of fits from ``others`` besides, starts of the same kind, the
+    likeliest counts. Raises ValueError for ``n`` that is not from 1 to `MAX_MODES`, another word, or values that are
+    not finite.
     """
     count = check_count(n, "n", queries=len(heatmap))
     heatmap = heatmap.float()
@@ -98,14 +102,17 @@ def fit_modes(
     mass = _interpolate(mass, grid)
     powered = _raise(mass, readout.exponent)
     step, middle = torch.stack([xs[1] - xs[0], ys[1] - ys[0]]), torch.stack([xs.mean(), ys.mean()])  # px a cell, px
+    given = [_make_params((each.to(mass) - middle) / step) for each in ([] if start is None else [start]) + [*others]]
+    fitted = [_run_em(powered, each, _describe_cells(grid, mass.device), readout) for each in given]
     if start is not None:
-        params = _make_params((start.to(mass) - middle) / step)
-        params = _run_em(powered, params, _describe_cells(grid, mass.device), readout.shape_prior)
+        params = fitted.pop(0)
     elif count is None:
-        params = _choose_fit(powered, grid, readout.shape_prior)
+        params = _choose_fit(powered, grid, readout)
     else:
         most = int(count.max()) if count.numel() else 1
-        params = _fit(powered, count.to(heatmap.device).expand(len(heatmap)), most, grid, readout.shape_prior)
+        params = _fit(powered, count.to(heatmap.device).expand(len(heatmap)), most, grid, readout)
+    for each in fitted:
+        params = _keep_likelier(powered, params, each, grid)
     params = _measure_shares(mass, params, grid, readout)
     params = _merge(params) if merge else params
     outlier_mass = _measure_outliers(mass, params, grid)
@@ -117,36 +124,52 @@ def fit_modes(
     return Mixture(modes, params[..., 2], covariances.masked_fill(absent[..., None], torch.nan), outlier_mass)
 
 
+@own_numerics()
+def find_peaks(heatmap: Tensor, n: Tensor, xs: Tensor, ys: Tensor) -> Tensor:
+    """Peaks (S, N, 2) px of heatmaps, ``n`` (S,) of each, NaN for further ones, as `fit_modes` finds where it starts.
+
+    That is on the grid itself, not on half of it, and without flattening.
+    """
+    step, middle = torch.stack([xs[1] - xs[0], ys[1] - ys[0]]), torch.stack([xs.mean(), ys.mean()])
+    params = _start(heatmap.float().flatten(1), n, int(n.max()), heatmap.shape[1:])
+    return (params[..., :2] * step + middle).masked_fill(params[..., 2:3] == 0, torch.nan)
+
+
 # A fit's parameters are (S, N, 6): a component's mean x, y, weight and covariance [[a, b], [b, c]], in cells, from the
 # grid's centre, so that one regularisation suits every image size. Weight 0 marks a component that a query has not.
 
 
-def _fit(mass: Tensor, n: Tensor, n_max: int, grid: tuple[int, int], shape_prior: float) -> Tensor:
+def _fit(mass: Tensor, n: Tensor, n_max: int, grid: tuple[int, int], readout: ModeReadout) -> Tensor:
     """Parameters of the fit to (S, C) mass; where a component collapsed, the likelier of it and one from the peaks."""
-    how = n_max, grid, shape_prior
+    how = n_max, grid, readout
     params = _fit_from(ANNEALING, mass, n, *how)
     weight = params[..., 2]
     poor = ((weight > 0) & (weight * n[:, None] < COLLAPSED)).any(1).nonzero()[:, 0]
     if not len(poor):
         return params
-    mass, cells, again = mass[poor], _describe_cells(grid, mass.device), _fit_from((), mass[poor], n[poor], *how)
-    before, after = (_compute_log_likelihood(mass, each, cells, even=EVEN) for each in (params[poor], again))
-    params[poor[after > before]] = again[after > before]
+    params[poor] = _keep_likelier(mass[poor], params[poor], _fit_from((), mass[poor], n[poor], *how), grid)
     return params
 
 
+def _keep_likelier(mass: Tensor, params: Tensor, others: Tensor, grid: tuple[int, int]) -> Tensor:
+    """Of two fits to each (S, C) mass, of as many components, the likelier."""
+    cells = _describe_cells(grid, mass.device)
+    before, after = (_compute_log_likelihood(mass, each, cells, even=EVEN) for each in (params, others))
+    return torch.where((after > before)[:, None, None], others, params)
+
+
 def _fit_from(
-    temperatures: tuple[float, ...], mass: Tensor, n: Tensor, n_max: int, grid: tuple[int, int], shape_prior: float
+    temperatures: tuple[float, ...], mass: Tensor, n: Tensor, n_max: int, grid: tuple[int, int], readout: ModeReadout
 ) -> Tensor:
     """Parameters of the fit to (S, C) mass, flattened before, in chunks of queries: memory stays bounded."""
     coarse, coarse_grid = _halve(mass, grid)
     size = _get_chunk(n_max, coarse)
     parts = zip(coarse.split(size), n.split(size), strict=True)
-    starts = [_anneal(temperatures, *part, n_max, coarse_grid, shape_prior) for part in parts]
+    starts = [_anneal(temperatures, *part, n_max, coarse_grid, readout) for part in parts]
     params = torch.cat(starts) * mass.new_tensor([2, 2, 1, 4, 4, 4])
     params[..., 0] += 0.5 * (grid[1] % 2)  # an odd grid was halved with a column, or a row, of nothing
     params[..., 1] += 0.5 * (grid[0] % 2)
-    return _run_em(mass, params, _describe_cells(grid, mass.device), shape_prior)
+    return _run_em(mass, params, _describe_cells(grid, mass.device), readout)
 
 
 def _merge(params: Tensor) -> Tensor:
@@ -203,7 +226,7 @@ def _halve(mass: Tensor, grid: tuple[int, int]) -> tuple[Tensor, tuple[int, int]
 
 
 def _anneal(
-    temperatures: tuple[float, ...], mass: Tensor, n: Tensor, n_max: int, grid: tuple[int, int], shape_prior: float
+    temperatures: tuple[float, ...], mass: Tensor, n: Tensor, n_max: int, grid: tuple[int, int], readout: ModeReadout
 ) -> Tensor:
     """State at the peaks, then fitted to the flattened mass, less and less flattened."""
     params, cells = _start(mass, n, n_max, grid), _describe_cells(grid, mass.device)
@@ -211,7 +234,7 @@ def _anneal(
         flat = mass ** (1 / temperature)
         flat /= flat.sum(-1, keepdim=True)
         for _ in range(ANNEALING_CYCLES):
-            params = _run_cycle(flat, params, cells, shape_prior)
+            params = _run_cycle(flat, params, cells, readout)
     return params
 
 
@@ -263,13 +286,13 @@ def _describe_cells(grid: tuple[int, int], device: torch.device) -> Tensor:
     return torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y])
 
 
-def _run_em(mass: Tensor, params: Tensor, cells: Tensor, shape_prior: float) -> Tensor:
+def _run_em(mass: Tensor, params: Tensor, cells: Tensor, readout: ModeReadout) -> Tensor:
     """Iterate until at rest; then the moments of each component's share of the mass, without the priors."""
     size, moving = _get_chunk(params.shape[1], mass), torch.arange(len(mass), device=mass.device)
     for _ in range(CYCLES):
         moved = []
         for part in moving.split(size):
-            after = _run_cycle(mass[part], params[part], cells, shape_prior)
+            after = _run_cycle(mass[part], params[part], cells, readout)
             moved.append((after - params[part])[..., :2].abs().amax((1, 2)) > TOLERANCE_CELLS)
             params[part] = after
         moving = moving[torch.cat(moved)]
@@ -281,25 +304,30 @@ def _run_em(mass: Tensor, params: Tensor, cells: Tensor, shape_prior: float) -> 
     return params
 
 
-def _run_cycle(mass: Tensor, params: Tensor, cells: Tensor, shape_prior: float) -> Tensor:
+def _run_cycle(mass: Tensor, params: Tensor, cells: Tensor, readout: ModeReadout) -> Tensor:
     """Two EM steps, a leap as far as their change of pace suggests, and a step that steadies it."""
-    first = _step(mass, params, cells, shape_prior)
-    second = _step(mass, first, cells, shape_prior)
+    first = _step(mass, params, cells, readout)
+    second = _step(mass, first, cells, readout)
     pace, change = first - params, second - 2 * first + params
     length = pace.flatten(1).norm(dim=1) / change.flatten(1).norm(dim=1).clamp(min=1e-12)
     length = length.clamp(1, LEAP)[:, None, None]
     leapt = params + 2 * length * pace + length**2 * change
     weight, a, b, c = leapt[..., 2:].unbind(-1)
     lawful = (a > MIN_VARIANCE) & (c > MIN_VARIANCE) & (a * c - b * b > MIN_VARIANCE**2) & (weight >= 0)
-    return _step(mass, torch.where(lawful.all(1)[:, None, None], leapt, second), cells, shape_prior)
+    return _step(mass, torch.where(lawful.all(1)[:, None, None], leapt, second), cells, readout)
 
 
-def _step(mass: Tensor, params: Tensor, cells: Tensor, shape_prior: float) -> Tensor:
+def _step(mass: Tensor, params: Tensor, cells: Tensor, readout: ModeReadout) -> Tensor:
     """One step of EM with the priors."""
     mean, weight, covariance = _compute_moments(mass, params, cells).split([2, 1, 3], -1)
-    width = 0.5 * (weight * covariance[..., ::2]).sum((1, 2)) / weight.sum((1, 2))  # (S,)
+    each = covariance[..., ::2].mean(-1)  # (S, N)
+    if readout.median_width:
+        width = each.masked_fill(params[..., 2] == 0, torch.nan).nanquantile(0.5, 1)  # (S,)
+    else:
+        width = (weight[..., 0] * each).sum(1) / weight.sum((1, 2))
     average = width[:, None, None] * width.new_tensor([1.0, 0.0, 1.0])
-    covariance = (weight * covariance + shape_prior * average) / (weight + shape_prior)
+    prior = readout.shape_prior
+    covariance = (weight * covariance + prior * average) / (weight + prior)
     weight = (weight + PRIOR_WEIGHT) * (params[..., 2:3] > 0)
     return torch.cat([mean, weight / weight.sum(1, keepdim=True), covariance], -1)
 
@@ -341,11 +369,11 @@ def _compute_log_likelihood(mass: Tensor, params: Tensor, cells: Tensor, *, even
     return torch.cat([(_compute_log_densities(s, cells).logsumexp(1).logaddexp(floor) * m).sum(-1) for m, s in parts])
 
 
-def _choose_fit(mass: Tensor, grid: tuple[int, int], shape_prior: float) -> Tensor:
+def _choose_fit(mass: Tensor, grid: tuple[int, int], readout: ModeReadout) -> Tensor:
     """State (S, 8, 6) with as many components as the Bayesian information criterion prefers."""
     cells, states, criteria = _describe_cells(grid, mass.device), [], []
     for n in range(1, MOST_MODES + 1):
-        params = _fit(mass, torch.full((len(mass),), n, device=mass.device), n, grid, shape_prior)
+        params = _fit(mass, torch.full((len(mass),), n, device=mass.device), n, grid, readout)
         likelihood = SAMPLES * _compute_log_likelihood(mass, params, cells)
         criteria.append((6 * n - 1) * float(np.log(SAMPLES)) - 2 * likelihood)
         states.append(F.pad(params, (0, 0, 0, MOST_MODES - n)))

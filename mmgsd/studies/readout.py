@@ -9,18 +9,21 @@ have been trained on. Half of the pairs choose the temperature; the errors are t
 from __future__ import annotations
 
 import copy
+import dataclasses
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from mmgsd.config import EvaluateConfig
 from mmgsd.dataset import Dataset
+from mmgsd.match.joint import join, predict, spread_places
 from mmgsd.match.matcher import QUARTERS, Matcher, read_heatmap
-from mmgsd.match.mixture import AS_IT_IS, Mixture
+from mmgsd.match.mixture import AS_IT_IS, Mixture, find_peaks
 from mmgsd.measure.metrics import aggregate
 from mmgsd.measure.questions import AnswerFunction, ask, choose_points, draw_pairs
 from mmgsd.model.heads import Outputs
@@ -46,6 +49,9 @@ class Way:
     means: bool = False  # modes at the means of their shares, however the weights are read
     turned: bool = False  # heatmaps of the target's quarter turns are averaged, not descriptors
     flipped: bool = False  # and those of both images' mirror images
+    median: bool = False  # modes are a priori as wide as the median of them, not as the mean
+    peaks: bool = False  # of a second fit, from the heatmap's peaks, the likelier counts
+    joint: bool = False  # of a second fit, from where the joint answer's maps lead, the likelier counts
     truth: bool = False  # the fit starts at the true matches: what no start can better
 
 
@@ -58,6 +64,10 @@ WAYS = {
     "means": Way("modes at the means of their shares", means=True),
     "turned": Way("heatmaps of four turns averaged", turned=True),
     "flipped": Way("heatmaps of both mirror images averaged", flipped=True),
+    "median": Way("median width as the prior", median=True),
+    "peaks": Way("likelier of two fits: the peaks", peaks=True),
+    "joint": Way("likelier of two fits: the joint answer", joint=True),
+    "starts": Way("likeliest of all three", peaks=True, joint=True),
     "truth": Way("fit started at the truth", truth=True),
 }
 
@@ -103,7 +113,7 @@ def _describe_all(matcher: Matcher, data: Dataset, config: EvaluateConfig) -> di
 
 def _flip(outputs: Outputs) -> Outputs:
     """What is said of a mirror image, laid onto the image itself."""
-    values = {field.name: getattr(outputs, field.name) for field in fields(outputs)}
+    values = {field.name: getattr(outputs, field.name) for field in dataclasses.fields(outputs)}
     return Outputs(**{name: x.flip(-1) if x is not None and x.ndim > 1 else x for name, x in values.items()})
 
 
@@ -112,24 +122,42 @@ def _make_answer(
 ) -> AnswerFunction:  # fmt: skip
     symmetry, points = data.group(matcher.config.group), choose_points(config.points, data.n_points)
     orbits = [symmetry.distinct_modes(int(point)) for point in points]
-    readout = AS_IT_IS if way.means else matcher.readout
+    readout = dataclasses.replace(AS_IT_IS if way.means else matcher.readout, median_width=way.median)
 
     def answer(first: int, second: int, xy: np.ndarray, n: np.ndarray) -> tuple[Mixture, Tensor]:
         """Modes and entropies (nats) of pixels ``xy`` of the first image."""
-        heatmaps = []
+        heatmaps, others = [], []
         for flipped in (False, True)[: 1 + way.flipped]:
             source, target = Outputs.mean(images[first, flipped]), images[second, flipped]
             targets = target if way.turned else [Outputs.mean(target)]
             heatmaps += [matcher.compute_heatmaps(source, one, torch.from_numpy(xy), data.size) for one in targets]
-        heatmap = torch.stack(heatmaps).mean(0)
-        centres, start = compute_cell_centres(data.size, heatmap.shape[-2:]), None
-        if way.truth:
-            start = torch.full((len(orbits), int(n.max()), 2), torch.nan)
-            for row, orbit in zip(start, orbits, strict=True):
-                row[: len(orbit)] = torch.from_numpy(data.xy[second, orbit])
-        return read_heatmap(heatmap, torch.from_numpy(n), centres, readout=readout, start=start)
+        heatmap, count = torch.stack(heatmaps).mean(0), torch.from_numpy(n)
+        centres = compute_cell_centres(data.size, heatmap.shape[-2:])
+        true = [torch.from_numpy(data.xy[second, orbit]) for orbit in orbits]
+        start = pad_sequence(true, batch_first=True, padding_value=torch.nan) if way.truth else None
+        if way.peaks:
+            others.append(find_peaks(heatmap, count, *centres))
+        if way.joint:
+            maps = _predict_jointly(matcher, data.load_mask(first), source, Outputs.mean(target), xy)
+            others.append(maps.masked_fill(torch.arange(maps.shape[1])[:, None] >= count[:, None, None], torch.nan))
+        return read_heatmap(heatmap, count, centres, readout=readout, start=start, others=others)
 
     return answer
+
+
+def _predict_jointly(
+    matcher: Matcher, mask: np.ndarray, source: Outputs, target: Outputs, xy: np.ndarray
+) -> Tensor:
+    """(S, n, 2) px: where each pixel of the first image has its matches by what its neighbours' say (`predict`)."""
+    size, places = mask.shape[::-1], spread_places(mask)
+    everywhere = np.concatenate([xy, places])
+    heatmap = matcher.compute_heatmaps(source, target, torch.from_numpy(everywhere), size)
+    centres = compute_cell_centres(size, heatmap.shape[-2:])
+    fit, _ = read_heatmap(heatmap, matcher.num_modes, centres, readout=matcher.readout)
+    modes, spread = fit.modes.numpy(), fit.covariances.diagonal(dim1=-2, dim2=-1).mean(-1).sqrt().numpy()
+    order = join(everywhere, mask, modes, fit.weights.numpy(), spread, places=len(places))
+    modes, spread = np.take_along_axis(modes, order[..., None], 1), np.take_along_axis(spread, order, 1)
+    return torch.from_numpy(predict(everywhere, mask, modes, spread)[: len(xy)])
 
 
 def describe_ways(results: Results) -> Table:

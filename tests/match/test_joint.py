@@ -13,7 +13,7 @@ import mmgsd
 from mmgsd.config import DEFAULT_GROUP, TrainConfig
 from mmgsd.dataset import Dataset, load_dataset
 from mmgsd.match import joint
-from mmgsd.match.joint import join, spread_places
+from mmgsd.match.joint import join, predict, spread_places
 from mmgsd.match.match import Match
 from mmgsd.match.matcher import Matcher
 from mmgsd.model.network import build_network
@@ -68,6 +68,17 @@ def test_more_questions_than_are_sorted_at_once_are_under_the_same_members(
     modes, shuffled = shuffle(turn_square(xy), rng)
     order = sort(xy, modes, MASK, len(xy) - 30)
     assert order.shape == (len(xy), 4) and count_right(order, shuffled) > 0.9
+
+
+def test_maps_lead_where_a_wrong_mode_ought_to_be(rng: np.random.Generator) -> None:
+    xy = spread_places(MASK)
+    true = turn_square(xy, bend=15.0)
+    modes = true.copy()
+    modes[7, 2] = modes[7, 0]
+    modes[9] = np.nan
+    there = predict(xy, MASK, modes, np.full(modes.shape[:2], 5.0))
+    errors = np.linalg.norm(there - true, axis=-1)
+    assert errors[[7, 9]].max() < 0.05 * SIDE and np.median(errors) < 0.05 * SIDE
 
 
 def test_a_rope_s_halves_are_told_apart_where_its_maps_cross(rng: np.random.Generator) -> None:

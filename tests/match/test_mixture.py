@@ -11,7 +11,7 @@ from sklearn.mixture import GaussianMixture
 from torch import Tensor
 
 from mmgsd.match import mixture
-from mmgsd.match.mixture import ModeReadout, fit_modes
+from mmgsd.match.mixture import ModeReadout, find_peaks, fit_modes
 from mmgsd.measure.metrics import compute_mode_errors
 from mmgsd.model.network import compute_cell_centres
 
@@ -326,3 +326,25 @@ def test_a_fit_goes_on_from_a_start_and_leaves_out_what_is_not_there() -> None:
     assert fit.weights[0].count_nonzero() == 3 and fit.modes[0, -1].isnan().all()
     whole = fit_modes(heatmap, 4, xs, ys, start=torch.tensor(CORNERS[None] + 9.0))
     np.testing.assert_allclose(sorted(whole.modes[0].tolist()), sorted(CORNERS.tolist()), atol=0.5)
+
+
+def test_of_several_starts_the_likeliest_fit_counts() -> None:
+    heatmap, true = draw_mixture(CORNERS, 8.0), torch.tensor(CORNERS[None])
+    poor = torch.tensor(CORNERS[None, [0, 0, 1, 1]] + [[3.0, 0], [-3.0, 0], [3.0, 0], [-3.0, 0]])
+    for start, others in ((poor, [true]), (true, [poor])):
+        fit = fit_modes(heatmap, 4, XS, YS, start=start, others=others)
+        np.testing.assert_allclose(sorted(fit.modes[0].tolist()), sorted(CORNERS.tolist()), atol=0.5)
+
+
+def test_peaks_are_where_the_heatmap_is_highest_and_absent_ones_none() -> None:
+    heatmap = torch.cat([draw_mixture(CORNERS, 8.0), draw_mixture(CORNERS[:2], 8.0)])
+    peaks = find_peaks(heatmap, torch.tensor([4, 2]), XS, YS)
+    assert measure_errors(peaks[0], CORNERS).max() <= CELL_PX and peaks[1, 2:].isnan().all()
+    assert measure_errors(peaks[1, :2], CORNERS[:2]).max() <= CELL_PX
+
+
+def test_the_median_of_the_widths_is_not_moved_by_one_wide_mode() -> None:
+    heatmap = 0.25 * draw_mixture(CORNERS[:1], 40.0) + 0.75 * draw_mixture(CORNERS[1:], 8.0)
+    fits = [fit_modes(heatmap, 4, XS, YS, readout=ModeReadout(5.0, median_width=median)) for median in (False, True)]
+    shares = [fit.weights.max() for fit in fits]
+    assert shares[1] < shares[0]  # the narrower the wide mode is believed to be, the less it takes from others
