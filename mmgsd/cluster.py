@@ -1,6 +1,7 @@
 """A Dask cluster of others', or one of processes here.
 
-The address of others' leads to a scheduler, which has workers, or a user is told what is missing.
+The address of others' leads to a scheduler, which has workers, or a user is told what is missing. Dask is imported
+where it is used: it takes as long as all else that a notebook which only shows results needs besides torch.
 """
 
 from __future__ import annotations
@@ -12,11 +13,12 @@ import sys
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from concurrent.futures import CancelledError, ThreadPoolExecutor
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from dask.distributed import Client, Future, LocalCluster, Security, wait
-from distributed.comm import connect
 from tqdm.auto import tqdm
+
+if TYPE_CHECKING:
+    from dask.distributed import Client, Future
 
 ANSWER = 10.0  # s that a scheduler has to answer
 PATIENCE = 30.0  # s that it has to take a client, and to have a worker before it is said that there is none
@@ -27,6 +29,8 @@ LOOPBACK = {"dashboard_address": "127.0.0.1:0", "worker_dashboard_address": "127
 
 def open_client(scheduler: str) -> Client:
     """A client of the scheduler at an address; ValueError where nothing answers there as Dask does."""
+    from dask.distributed import Client
+
     return Client(check_scheduler("scheduler", scheduler), timeout=PATIENCE)
 
 
@@ -45,6 +49,9 @@ def check_scheduler(name: str, address: str) -> str:
 
 async def _greet(address: str) -> None:
     """A client would wait for ever where somebody listens and says nothing."""
+    from dask.distributed import Security
+    from distributed.comm import connect
+
     comm = await connect(address, timeout=ANSWER, **Security().get_connection_args("client"))
     comm.abort()
 
@@ -52,9 +59,24 @@ async def _greet(address: str) -> None:
 @contextlib.contextmanager
 def open_processes(count: int) -> Iterator[Client]:
     """A client of ``count`` processes on this machine, which end with this one; each does a task at a time."""
-    with unchanged_environment(), LocalCluster(
-        n_workers=count, threads_per_worker=1, host="127.0.0.1", memory_limit=0, **LOOPBACK
-    ) as cluster, Client(cluster) as client:  # fmt: skip
+    with _open_cluster(n_workers=count, threads_per_worker=1, host="127.0.0.1", memory_limit=0) as client:
+        yield client
+
+
+@contextlib.contextmanager
+def open_threads(count: int = 0) -> Iterator[Client]:
+    """A client of ``count`` threads of this process (0: one a core that it may use), for tasks that wait for others."""
+    from dask.system import cpu_count  # affinity and quotas count
+
+    with _open_cluster(n_workers=1, threads_per_worker=count or cpu_count(), processes=False) as client:
+        yield client
+
+
+@contextlib.contextmanager
+def _open_cluster(**how: Any) -> Iterator[Client]:
+    from dask.distributed import Client, LocalCluster
+
+    with unchanged_environment(), LocalCluster(**how, **LOOPBACK) as cluster, Client(cluster) as client:
         yield client
 
 
@@ -89,6 +111,8 @@ def wait_for_each(client: Client, futures: Collection[Future]) -> Iterator[Futur
 
     RuntimeError where the scheduler itself is lost.
     """
+    from dask.distributed import wait
+
     pending, seen, address = set(futures), time.monotonic(), client.scheduler.address
     while pending:
         done: Collection[Future] = ()

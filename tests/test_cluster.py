@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import socket
 import threading
 import time
@@ -11,7 +12,7 @@ import pytest
 from dask.distributed import Client, LocalCluster
 
 from mmgsd import cluster
-from mmgsd.cluster import open_client, unchanged_environment, wait_for_each
+from mmgsd.cluster import open_client, open_threads, unchanged_environment, wait_for_each
 
 
 @pytest.fixture
@@ -75,3 +76,16 @@ def test_a_lost_scheduler_is_named(theirs: LocalCluster, monkeypatch: pytest.Mon
         threading.Timer(0.5, theirs.close).start()
         with pytest.raises(RuntimeError, match=f"{address} was lost"):
             list(waiting)
+
+
+@pytest.mark.parametrize(("cores", "quota", "expected"), [(64, (400000, 100000), 4), (2, (None, None), 2)])
+def test_as_many_threads_as_cores_that_may_be_used(
+    monkeypatch: pytest.MonkeyPatch, cores: int, quota: tuple, expected: int
+) -> None:
+    import dask.system
+
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(cores)))
+    monkeypatch.setattr(dask.system.psutil.Process, "cpu_affinity", lambda self: list(range(cores)))
+    monkeypatch.setattr(dask.system, "_try_extract_cgroup_cpu_quota", lambda: quota)
+    with open_threads() as client:
+        assert sum(client.nthreads().values()) == expected

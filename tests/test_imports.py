@@ -78,9 +78,15 @@ def test_what_stands_beside_the_packages_imports_none() -> None:
     assert found == set()
 
 
-@pytest.mark.parametrize("module", ["mmgsd.learn.training", "mmgsd.match.matcher", "mmgsd.measure.calibration"])
-def test_training_and_matching_go_without_baselines(module: str) -> None:
-    unwanted = "m for m in sys.modules if m.startswith(('mmgsd.match.baselines', 'skimage', 'matplotlib'))"
-    code = f"import sys, {module}; print([{unwanted}])"
+@pytest.mark.parametrize(
+    ("code", "without"),
+    [
+        ("import mmgsd.learn.training, mmgsd.measure.calibration", ("mmgsd.match.baselines", "skimage", "matplotlib")),
+        ("from mmgsd.studies.registry import list_studies; list_studies()", ("distributed", "bpy")),
+    ],
+    ids=["training and matching without baselines", "results without a cluster"],
+)
+def test_nobody_waits_for_what_others_need(code: str, without: tuple[str, ...]) -> None:
+    code += f"; import sys; print([m for m in sys.modules if m.startswith({without})])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

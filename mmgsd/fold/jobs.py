@@ -12,9 +12,9 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from dask.distributed import Client
 
 from mmgsd.checks import check, check_choice, read_count, read_flag
 from mmgsd.cluster import run_tasks
@@ -23,6 +23,9 @@ from mmgsd.fold.state import State, read_state
 from mmgsd.fold.tasks import GROUNDS, MOTIONS, STARTS, Move, Task, find_task, place_truth
 from mmgsd.progress import ProgressBar
 from mmgsd.scene.stage import connect, run_job
+
+if TYPE_CHECKING:
+    from dask.distributed import Client
 
 VERSION = 1  # to be raised where the same job gives another state than before
 JOBS_A_BATCH = 12  # a child process ends after so many at most: it takes seconds to start

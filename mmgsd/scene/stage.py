@@ -21,15 +21,14 @@ import zipfile
 import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
-from dask.distributed import Client, LocalCluster
-from dask.system import cpu_count
 
 from mmgsd import files
 from mmgsd.checks import check, read_count, read_flag
-from mmgsd.cluster import LOOPBACK, open_client, run_tasks, unchanged_environment
+from mmgsd.cluster import open_client, open_threads, run_tasks
 from mmgsd.config import DEFAULT_GROUP, OBJECTS, OWN_GROUP, RenderConfig, list_later, to_dict
 from mmgsd.dataset import load_dataset
 from mmgsd.dataset_format import FORMAT, SPLITS, encode_table, find_owner, is_member
@@ -37,6 +36,9 @@ from mmgsd.paths import find_root
 from mmgsd.progress import ProgressBar
 from mmgsd.scene.objects.planar_object import PlanarObject, load_planar_object
 from mmgsd.symmetry import GRID_GROUPS, LINE_GROUPS, load_group, load_mirror
+
+if TYPE_CHECKING:
+    from dask.distributed import Client
 
 IMAGES_A_BATCH = 30  # a child process ends after about so many, which bounds its memory
 SCENES = {"cloth": 2, "rope": 1}  # to be raised where the same configuration gives another object than before
@@ -203,10 +205,7 @@ def connect(workers: int, scheduler: str) -> Iterator[Client]:
         with open_client(scheduler) as client:
             yield client
         return
-    threads = workers or cpu_count()  # they only wait for the children; affinity and quotas count
-    with unchanged_environment(), LocalCluster(
-        n_workers=1, threads_per_worker=threads, processes=False, **LOOPBACK
-    ) as cluster, Client(cluster) as client:  # fmt: skip
+    with open_threads(workers) as client:  # they only wait for the children
         try:
             yield client
         finally:

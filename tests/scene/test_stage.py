@@ -336,18 +336,6 @@ def test_nothing_listens_beyond_this_machine_while_it_renders(tmp_path: Path, mo
     assert listening <= {"127.0.0.1", "::1"}
 
 
-@pytest.mark.parametrize(("cores", "quota", "expected"), [(64, (400000, 100000), 4), (2, (None, None), 2)])
-def test_as_many_children_as_cores_that_may_be_used(
-    monkeypatch: pytest.MonkeyPatch, cores: int, quota: tuple, expected: int
-) -> None:
-    import dask.system
-
-    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(cores)))
-    monkeypatch.setattr(dask.system.psutil.Process, "cpu_affinity", lambda self: list(range(cores)))
-    monkeypatch.setattr(dask.system, "_try_extract_cgroup_cpu_quota", lambda: quota)
-    assert stage.cpu_count() == expected
-
-
 def test_children_and_their_temporary_folders_go_with_a_killed_parent(tmp_path: Path) -> None:
     temporary = tmp_path / "tmp"
     temporary.mkdir()
