@@ -44,22 +44,24 @@ def ask(
     bar = ProgressBar(pairs, desc=f"evaluate {name}", disable=not progress, leave=False)
     for pair, (first, second) in enumerate(bar):
         fit, entropy = answer(first, second, data.xy[first, points], count.clip(min=modes))
-        frame = pd.DataFrame({"pair": pair, "image0": first, "image1": second, "point": points})
-        frame = frame.assign(visible=data.visible[first, points], n=count, entropy=entropy.cpu().numpy())
         hidden = [int((~data.visible[second, o]).sum()) for o in orbits]
-        frame = frame.assign(hidden=hidden, outside=fit.outlier_mass.cpu().numpy())
+        columns = {
+            "pair": pair, "image0": first, "image1": second, "point": points, "visible": data.visible[first, points],
+            "n": count, "entropy": entropy.cpu().numpy(), "hidden": hidden, "outside": fit.outlier_mass.cpu().numpy(),
+        }  # fmt: skip
         means, covariances, weights = (t.double().cpu().numpy() for t in (fit.modes, fit.covariances, fit.weights))
-        frame[list(LISTS)] = None
+        lists = {name: np.empty(len(points), object) for name in LISTS}
+        errors: dict[str, np.ndarray] = {}
         for n in np.unique(count):
             rows = np.flatnonzero(count == n)
             points_there = np.stack([orbits[r] for r in rows])
             true, seen = data.xy[second][points_there].astype(float), data.visible[second][points_there]
             for column, values in compute_query_errors(means[rows, :n], covariances[rows, :n], true, seen).items():
-                frame.loc[rows, column] = values
-            lists = compute_mode_lists(means[rows, :n], covariances[rows, :n], weights[rows, :n], true)
-            for column, values in lists.items():
-                frame.loc[rows, column] = pd.Series(list(values.astype(np.float32)), rows)
-        frames.append(frame)
+                errors.setdefault(column, np.zeros(len(points), values.dtype))[rows] = values
+            of_modes = compute_mode_lists(means[rows, :n], covariances[rows, :n], weights[rows, :n], true)
+            for column, values in of_modes.items():
+                lists[column][rows] = [*values.astype(np.float32)]
+        frames.append(pd.DataFrame(columns | lists | errors))
     return pd.concat(frames, ignore_index=True)
 
 
