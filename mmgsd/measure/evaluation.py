@@ -18,7 +18,8 @@ from mmgsd.config import EvaluateConfig, digest
 from mmgsd.dataset import Dataset, load_dataset
 from mmgsd.dataset_format import UNREADABLE
 from mmgsd.files import DamagedFileError, atomic_write, is_kept, read_json, saying_what_stays, write_json
-from mmgsd.match.baselines import BASELINES, OPTIONAL, BaselineMatcher
+from mmgsd.match.baselines import BASELINES, EXTRACTORS, OPTIONAL, BaselineMatcher, FeatureMatcher
+from mmgsd.match.features import Extractor
 from mmgsd.match.matcher import Matcher, check_scales, read_heatmap
 from mmgsd.match.mixture import AS_IT_IS, Mixture, ModeReadout, check_modes
 from mmgsd.measure.metrics import aggregate
@@ -150,7 +151,9 @@ def _is_nested(values: Any, depth: int) -> bool:
 def _classical_answer(method: str, readout: ModeReadout, data: Dataset) -> AnswerFunction:
     images = [data.load_image(i) for i in range(len(data))]
     masks = [data.load_mask(i) for i in range(len(data))]
-    matcher, last = BaselineMatcher(method), np.array(data.size, dtype=np.float32) - 0.5
+    last = np.array(data.size, dtype=np.float32) - 0.5
+    # images are kept, so each array is known again: a network says the same of it in every pair
+    matcher = FeatureMatcher(_once(EXTRACTORS[method])) if method in EXTRACTORS else BaselineMatcher(method)
 
     def answer(first: int, second: int, xy: np.ndarray, n: np.ndarray) -> tuple[Mixture, Tensor]:
         """Modes and entropies (nats) of pixels ``xy`` of the first image."""
@@ -159,6 +162,19 @@ def _classical_answer(method: str, readout: ModeReadout, data: Dataset) -> Answe
         return read_heatmap(heatmap, torch.from_numpy(n), centres, readout=readout)
 
     return answer
+
+
+def _once(extract: Extractor) -> Extractor:
+    """The same for arrays that stay as they are, each asked about once."""
+    known: dict[int, Any] = {}
+
+    def extract_new(image: np.ndarray) -> Any:
+        """What ``extract`` said of this array."""
+        if id(image) not in known:
+            known[id(image)] = extract(image)
+        return known[id(image)]
+
+    return extract_new
 
 
 def _chance_answer(method: str, data: Dataset) -> AnswerFunction:
