@@ -33,15 +33,20 @@ JOBS_A_BATCH = 12  # a child process ends after so many at most: it takes second
 PixelMove = tuple[tuple[float, float], tuple[float, float]]  # pick and place, (x, y) px each
 
 
-def start_job(task: Task, start: str, ground: str, seed: int) -> dict:
+def start_job(task: Task, start: str, ground: str, seed: int, *, turn_deg: float | None = None) -> dict:
     """A rollout's first state: the object lies in ``start``, turned by any angle, seen by a random camera.
 
+    With ``turn_deg`` it is seen turned by no more than that, both ways, here and after each act: on a plain ground.
     How it lies depends on task, start and seed alone, what it looks like on the ground too. ValueError for a start that
-    the task's object has not, or another ground than those of ``GROUNDS``.
+    the task's object has not, another ground than those of ``GROUNDS``, and for a turn beyond 180 or in a workspace.
     """
     check_choice("start", start, STARTS[task.object])
-    check_choice("ground", ground, GROUNDS)
-    return _begin("start", task, start, ground, seed)
+    check_choice("ground", ground, GROUNDS if turn_deg is None else ("plain",))
+    job = _begin("start", task, start, ground, seed)
+    if turn_deg is None:
+        return job
+    check("turn_deg", turn_deg, "between 0 and 180", 0 <= turn_deg <= 180)
+    return _marked({name: value for name, value in job.items() if name != "mark"} | {"turn_deg": float(turn_deg)})
 
 
 def demonstration_job(task: Task, seed: int) -> dict:

@@ -73,13 +73,15 @@ def begin(job: dict[str, Any]) -> State:
     task = find_task(job["task"])
     about = {key: job[key] for key in ("object", "task", "start", "ground", "seed", "mark")}
     about |= {"demonstration": job["kind"] == "demonstration", "look": 0, "fault": "", "thickness": 0.0}
+    about |= {"turn_deg": job["turn_deg"]} if "turn_deg" in job else {}
     rng = _stream(about, "shape")
     if task.object == "cloth":
         vertices = _begin_cloth(rng, about)
     else:
         vertices, about["thickness"] = _begin_rope(rng, about)
     if not about["demonstration"]:
-        vertices = vertices @ spin(rng.uniform(0, 2 * np.pi)).T
+        turn = rng.uniform(0, 2 * np.pi)
+        vertices = vertices if "turn_deg" in about else vertices @ spin(turn).T
         vertices[:, :2] += rng.uniform(-MAX_OFFSET, MAX_OFFSET, size=2)
     return _look(vertices.astype(np.float32), None, about)
 
@@ -335,7 +337,7 @@ def _draw_camera(room: np.ndarray, about: dict[str, Any]) -> tuple[Camera, float
     if about["demonstration"]:
         return frame_points(rng, room, size, 0.0, 0.0, 0.85, 3.0, shift=0.0), 0.0
     if about["ground"] == "plain":
-        camera, turn = randomize.draw_camera(rng, room, size, 180.0)
+        camera, turn = randomize.draw_camera(rng, room, size, about.get("turn_deg", 180.0))
         return camera, float(np.radians(turn))
     turn, tilt = rng.uniform(-np.pi, np.pi), rng.uniform(0, MAX_TILT_DEG)
     return frame_points(rng, room, size, turn, tilt, rng.uniform(0.7, 0.95), rng.uniform(1.2, 3.0)), turn

@@ -62,11 +62,13 @@ class Rollout:
     start: str
     ground: str
     seed: int
+    turn_deg: float | None = None  # the most that the object is seen turned by, both ways; None: by any angle
 
     @property
     def name(self) -> str:
         """What its files are called by."""
-        return f"{self.task}-{self.start.replace(' ', '_')}-{self.ground}-{self.seed}"
+        within = "" if self.turn_deg is None else f"-within-{self.turn_deg:g}"
+        return f"{self.task}-{self.start.replace(' ', '_')}-{self.ground}-{self.seed}{within}"
 
 
 Arm = tuple[Policy, Rollout]
@@ -79,6 +81,12 @@ def list_rollouts(object: str, count: int) -> list[Rollout]:
     turns = [(kinds, k) for k in range(count)] + [(more, k) for k in range(int(MORE[1] * count) if more else 0)]
     return [Rollout(*chosen[k % len(chosen)], GROUNDS[k // len(chosen) % len(GROUNDS)], seed)
             for seed, (chosen, k) in enumerate(turns)]  # fmt: skip
+
+
+def list_limited(object: str, count: int, turn_deg: float) -> list[Rollout]:
+    """``count`` rollouts of an object, its tasks and starts in turn, on plain ground and within a limit (°)."""
+    kinds = [(task.name, start) for task in TASKS.values() if task.object == object for start in task.starts]
+    return [Rollout(*kinds[seed % len(kinds)], "plain", seed, turn_deg) for seed in range(count)]
 
 
 def run(
@@ -136,7 +144,7 @@ class Bench:
     def make_starts(self, rollouts: list[Rollout]) -> dict[Rollout, Path]:
         """First states, and before them the states that the rollouts' demonstrations go through."""
         self.demonstrate({rollout.task: find_task(rollout.task) for rollout in rollouts}.values())
-        jobs = {r.name: start_job(find_task(r.task), r.start, r.ground, r.seed) for r in rollouts}
+        jobs = {r.name: start_job(find_task(r.task), r.start, r.ground, r.seed, turn_deg=r.turn_deg) for r in rollouts}
         files = run_jobs(jobs, self.folder / "starts", **self.how)
         return {rollout: files[rollout.name] for rollout in rollouts}
 
@@ -316,13 +324,31 @@ def summarise_policies(
 
     Rollouts count that the true matches succeed in, and that are no success where "nothing" is done.
     """
-    done = {name for name, row in found["nothing"].items() if row["success"]}
-    reachable = {name for name, row in found.get("truth", {}).items() if row["success"]} - done
+    reachable = find_reachable(found)
     rows = {**stored, **{name: summarise_rollouts(ended, reachable) for name, ended in found.items()}}
     if REFERENCE in rows:
         for row in rows.values():
             row["beyond"] = compare_rollouts(rows[REFERENCE]["rollouts"], row["rollouts"], reachable)
     return {name: rows[name] for name in POLICIES if name in rows}
+
+
+def find_reachable(found: Mapping[str, dict[str, dict[str, Any]]]) -> set[str]:
+    """Names of the rollouts that count: the true matches succeed in them, and doing "nothing" does not."""
+    done = {name for name, row in found["nothing"].items() if row["success"]}
+    return {name for name, row in found.get("truth", {}).items() if row["success"]} - done
+
+
+def measure_success(
+    bench: Bench, policies: Iterable[Policy], rollouts: Iterable[Rollout]
+) -> dict[str, dict[str, Any]]:  # fmt: skip
+    """{policy: share of successes with its interval} over those of some rollouts that count."""
+    starts = bench.make_starts(list(rollouts))
+    kept = [rollout for rollout in starts if not read_state(starts[rollout]).about["fault"]]
+    found = bench.roll([POLICIES["truth"], *policies], kept, starts)
+    untouched = {rollout.name: bench.judge(rollout, starts[rollout], []) for rollout in kept}
+    reachable = find_reachable({"nothing": untouched} | found)
+    return {name: estimate_share([row["success"] for key, row in ended.items() if key in reachable])
+            for name, ended in found.items()}  # fmt: skip
 
 
 def read_kept(path: Path, mark: Mapping[str, Any]) -> dict[str, Any] | None:

@@ -36,6 +36,7 @@ class Policy:
     chosen: str = ""
     # instead of shipped weights: the row of the main table that the preset `TRAINED_BY` trained
     trained: str = field(default="", repr=False)  # the weights themselves are what an answer depends on
+    weights: Path | None = field(default=None, repr=False)  # or this file
     one: bool = field(default=False, repr=False)  # answers with one mode, as what learnt one match a pixel does
     named: bool = field(default=False, repr=False)  # looks for places by name, whatever the demonstration's picture
     looks: int = 1  # where few of its modes agree, it looks so often, each time from elsewhere, before it acts
@@ -77,6 +78,8 @@ def load_matcher(policy: Policy, object: str) -> Any:
 
 def find_answering(policy: Policy, object: str) -> Path:
     """The file of weights that answers; FileNotFoundError for a model that is not trained yet."""
+    if policy.weights:
+        return policy.weights
     if not policy.trained:
         return find_weights(object + policy.matcher)
     model = configure_model(load_preset(TRAINED_BY), object, policy.trained)

@@ -1,12 +1,13 @@
 """Why one match is nearly as good as all of them, and when it is not: models trained on poses within ± a limit.
 
     python -m mmgsd run pose_range              -> data/results/quick/pose_range.json; a killed call goes on
-    python -m mmgsd run pose_range --set objects=cloth --set seeds=1
+    python -m mmgsd run pose_range --set objects=cloth --set seeds=1 --set folds=0
 
 Cross-entropy is linear in its target: where each labelling of what is seen is as probable as any other, the mean of
 one-match targets is the mixture of all matches, and Unimodal a noisier estimate of MMGSD's objective. Where the object
 always arrives about the same way round, its labelling can be told from its pose, and a one-match model learns it.
-Nothing is turned by augmentation here: a limit is that of the rendered images.
+Nothing is turned by augmentation here: a limit is that of the rendered images. The first seed's models fold, too, from
+states that are seen within the same limit.
 """
 
 from __future__ import annotations
@@ -24,13 +25,17 @@ from matplotlib.figure import Figure
 from mmgsd.checks import check_choice, read_count
 from mmgsd.config import OBJECTS, TrainConfig, load_preset
 from mmgsd.figures.style import PAGE_IN, finish_axes, save_figure, styled
-from mmgsd.measure.evaluation import read_results
+from mmgsd.fold.moves import AGREE
+from mmgsd.learn.training import train_model
+from mmgsd.measure.evaluation import read_results, write_results
 from mmgsd.paths import Paths
 from mmgsd.progress import ProgressBar
 from mmgsd.scene.stage import render_dataset
 from mmgsd.studies.claims import MARGIN, Claim, get
+from mmgsd.studies.folding import Bench, list_limited, measure_success
 from mmgsd.studies.matrix import list_missing, measure_each, train_and_measure
 from mmgsd.studies.models import ROWS, Model, configure_study, get_colour, get_label, get_line_style
+from mmgsd.studies.policies import Policy
 from mmgsd.studies.registry import Finding, Results, Shown, Study, read_table
 from mmgsd.studies.seeds import compare_seeds, list_seeds, say_seeds
 from mmgsd.studies.table import Column, Table
@@ -38,6 +43,7 @@ from mmgsd.studies.table import Column, Table
 LIMITS_DEG = (15, 45, 90, 180)  # of the object's turn, both ways; the last is any
 METHODS = ("mmgsd", "unimodal", "spcl", "pcl")
 SEEDS = 3
+FOLDS = 24  # rollouts within each limit
 NARROW = (15, 45)  # limits within which a pose tells the labelling: no more than half of the turn that looks alike
 
 
@@ -56,18 +62,24 @@ def render_limited(paths: Paths, object: str, limit: int) -> Path:
     return render_dataset(limited, folder)
 
 
-def check(paths: Paths, *, seeds: int = SEEDS, objects: str | Sequence[str] = OBJECTS) -> None:
-    """ValueError for another number of seeds than one from 1 on, and for objects that have no such symmetry."""
+def check(
+    paths: Paths, *, seeds: int = SEEDS, objects: str | Sequence[str] = OBJECTS, folds: int = FOLDS
+) -> None:  # fmt: skip
+    """ValueError for other numbers of seeds and folds than from 1 and 0 on, and for objects without such a symmetry."""
+    read_count("folds", folds)
     if read_count("seeds", seeds) < 1:
         raise ValueError(f"seeds must be at least 1, got {seeds}")
     for name in _list_objects(objects):
         check_choice("objects", name, OBJECTS)
 
 
-def run(paths: Paths, *, seeds: int = SEEDS, objects: str | Sequence[str] = OBJECTS) -> Path:
+def run(
+    paths: Paths, *, seeds: int = SEEDS, objects: str | Sequence[str] = OBJECTS, folds: int = FOLDS
+) -> Path:  # fmt: skip
     """Render each limit's images, train each method with ``seeds`` seeds on them, and ask; pose_range.json.
 
-    A row that is stored of the same model is kept: neither its images nor its weights are needed again.
+    Then the first seed's models fold, in so many rollouts (``folds``) of each object and limit, or in none. A row that
+    is stored of the same model is kept: neither its images nor its weights are needed again.
     """
     file = paths.results / "pose_range.json"
     arms = [(name, limit) for name in _list_objects(objects) for limit in LIMITS_DEG]
@@ -77,6 +89,8 @@ def run(paths: Paths, *, seeds: int = SEEDS, objects: str | Sequence[str] = OBJE
         folders = [render_limited(paths, name, turn) for turn in (limit, LIMITS_DEG[-1])] if models else []
         ask = partial(_measure, paths=paths, limit=limit, folders=folders)
         measure_each(models, file, place, ask, desc=f"{name} {say_limit(limit)}")
+    for name, limit in ProgressBar(arms if folds else [], desc="folding within limits"):
+        _fold(paths, name, limit, folds)
     save_figure(plot_limits(read_results(file, depth=3)), paths.figures / "pose_range")
     return file
 
@@ -89,6 +103,26 @@ def _measure(
         model, paths=paths, place=paths.generated / "pose_range", name=f"{model.name}-within-{limit}",
         images=folders[0], asked=dict(zip(("within", "any"), folders, strict=True)), progress=progress,
     )  # fmt: skip
+
+
+def _fold(paths: Paths, object: str, limit: int, count: int) -> None:
+    """Put into the rows of the first seed's models how often they fold; those that are there stay."""
+    file, place = paths.results / "pose_range.json", paths.generated / "pose_range"
+    results = read_results(file, depth=3)
+    rows = {key: row for key, row in results[object][str(limit)].items() if key.endswith("-0")}
+    models = {key: model for key, model in list_models(paths.preset, object, 1).items()
+              if key in rows and get(rows[key], "folds", "rollouts") != count}  # fmt: skip
+    if not models:
+        return
+    images = render_limited(paths, object, limit)
+    weights = {key: train_model(model, images, place / "models" / f"{model.name}-within-{limit}")
+               for key, model in models.items()}  # fmt: skip
+    policies = [Policy(f"{key}-{limit}", "", "", chosen=AGREE, weights=path) for key, path in weights.items()]
+    bench = Bench(place / "folding", {"progress": True})
+    found = measure_success(bench, policies, list_limited(object, count, limit))
+    for key in models:
+        rows[key]["folds"] = found[f"{key}-{limit}"] | {"rollouts": count}
+    write_results(results, file)
 
 
 def _list_objects(objects: str | Sequence[str]) -> list[str]:
@@ -116,6 +150,7 @@ def describe_limits(results: Results) -> Table:
     columns = [
         Column("rmse", "RMSE", "RMSE px", optional=True),
         Column("found", "≤20", "pck@20px", ".0f", scale=100, optional=True),
+        Column("folds", "folds", "folds", optional=True),
         Column("p", "p", form=".3f", optional=True), Column("nearest", page="nearest match px", optional=True),
         Column("any", "all poses", "RMSE px, all poses", optional=True),
     ]  # fmt: skip
@@ -126,7 +161,9 @@ def _describe_row(results: Results, object: str, limit: int, method: str) -> dic
     within = get_rows(results, object, limit)
     every = None if limit == LIMITS_DEG[-1] else _mean(get_rows(results, object, limit, "any"), method)
     found, nearest = (_mean(within, method, measure) for measure in ("pck@20px", "nearest_mean"))
-    return {"rmse": say_seeds(within, method), "found": found, "nearest": nearest, "any": every}
+    folds = get(results, object, str(limit), f"{method}-0", "folds")
+    told = folds and folds["count"] and f"{100 * folds['mean']:.0f} % of {folds['count']}"
+    return {"rmse": say_seeds(within, method), "found": found, "folds": told, "nearest": nearest, "any": every}
 
 
 def _mean(rows: Mapping[str, Results], method: str, measure: str = "rmse_mean") -> float | None:

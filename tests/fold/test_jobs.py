@@ -20,6 +20,7 @@ NOWHERE = [((-40.0, -40.0), (200.0, 200.0))]
 STARTS = {
     "edge": start_job(TASKS["edge"], "flat", "plain", 3),
     "straighten": start_job(TASKS["straighten"], "bent", "workspace", 3),
+    "within": start_job(TASKS["edge"], "flat", "plain", 3, turn_deg=10.0),
     "demonstrated-edge": demonstration_job(TASKS["edge"], 0),
     "demonstrated-straighten": demonstration_job(TASKS["straighten"], 0),
 }
@@ -46,6 +47,19 @@ def acted(first, tmp_path_factory):
     jobs["looked"] = look_job(first["edge"], 1)
     files = run(jobs, tmp_path_factory.mktemp("acted"))
     return {name: read_state(path) for name, path in files.items()}
+
+
+def test_a_state_within_a_limit_is_seen_about_as_the_demonstration_is(first):
+    sides = [np.subtract(*read_state(first[name]).xy[[24, 0]]) for name in ("within", "demonstrated-edge")]
+    angles = np.degrees([np.arctan2(y, x) for x, y in sides])
+    assert abs(angles[0] - angles[1]) < 15  # the limit, and what the camera's tilt adds
+    assert start_job(TASKS["edge"], "flat", "plain", 3)["mark"] == STARTS["edge"]["mark"] != STARTS["within"]["mark"]
+
+
+@pytest.mark.parametrize(("ground", "turn_deg"), [("workspace", 10.0), ("plain", 181.0), ("plain", -1.0)])
+def test_a_limit_is_of_plain_ground_and_half_a_turn_at_most(ground, turn_deg):
+    with pytest.raises(ValueError, match="ground must|turn_deg must"):
+        start_job(TASKS["edge"], "flat", ground, 3, turn_deg=turn_deg)
 
 
 def test_a_job_gives_the_same_bytes_in_another_process_and_another_company(first, tmp_path):

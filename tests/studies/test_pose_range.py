@@ -65,7 +65,7 @@ def test_models_differ_in_method_and_seed_and_are_never_turned():
     assert len({model.name for model in models.values()}) == len(models)
 
 
-@pytest.mark.parametrize(("name", "value"), [("seeds", 0), ("objects", "towel")])
+@pytest.mark.parametrize(("name", "value"), [("seeds", 0), ("objects", "towel"), ("folds", -1)])
 def test_options_are_checked_before_anything_is_rendered(tmp_path, name, value):
     with pytest.raises(ValueError, match=name):
         pose_range.check(Paths(tmp_path, "smoke"), **{name: value})
@@ -89,15 +89,29 @@ def test_run_trains_within_each_limit_asks_both_and_goes_on(tmp_path, tiny_datas
     monkeypatch.setattr(pose_range, "LIMITS_DEG", (15, 180))
     monkeypatch.setattr(pose_range, "METHODS", ("mmgsd", "unimodal"))
     paths = Paths(tmp_path, "smoke")
-    file = pose_range.run(paths, seeds=1, objects="cloth")
+    file = pose_range.run(paths, seeds=1, objects="cloth", folds=0)
     rows = read_results(file, depth=3)["cloth"]
     assert {limit: set(row) for limit, row in rows.items()} == dict.fromkeys(("15", "180"), {"mmgsd-0", "unimodal-0"})
     assert set(rows["15"]["mmgsd-0"]) == {"within", "any", "run"}
     assert rendered == {paths.generated / "pose_range" / "cloth-15": 15, paths.dataset("cloth"): 180}
     assert len(set(trained)) == 4
     trained.clear()
-    pose_range.run(paths, seeds=1, objects="cloth")
+    pose_range.run(paths, seeds=1, objects="cloth", folds=0)
     assert not trained
+    folded = []
+
+    def fold(bench, policies, rollouts) -> dict:
+        folded.append([policy.weights.parent.name for policy in policies])
+        assert {rollout.turn_deg for rollout in rollouts} == {15 if "15" in folded[-1][0][-3:] else 180}
+        return {policy.name: {"mean": 0.5, "count": len(rollouts)} for policy in policies}
+
+    monkeypatch.setattr(pose_range, "measure_success", fold)
+    for _ in range(2):
+        pose_range.run(paths, seeds=1, objects="cloth", folds=3)
+    assert [len(names) for names in folded] == [2, 2] and all("-within-" in name for names in folded for name in names)
+    rows = read_results(file, depth=3)
+    assert rows["cloth"]["15"]["mmgsd-0"]["folds"] == {"mean": 0.5, "count": 3, "rollouts": 3}
+    assert pose_range.describe_limits(rows).rows["±15°, MMGSD"]["cloth"]["folds"] == "50 % of 3"
     assert (paths.figures / "pose_range.png").is_file()
 
 
