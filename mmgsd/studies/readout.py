@@ -162,8 +162,8 @@ def _predict_jointly(
 
 def describe_ways(results: Results) -> Table:
     """The errors of every way, a row each; weights and their images beside each other."""
-    labels = {name: way.label for name, way in WAYS.items()}
-    return Table("read", {"": ERRORS}, list_rows(results, labels), list(list_parts(results)))
+    labels, columns = {name: way.label for name, way in WAYS.items()}, [c for c in ERRORS if c.key != "median"]
+    return Table("read", {"": columns}, list_rows(results, labels), list(list_parts(results)))
 
 
 STUDY = Study(
