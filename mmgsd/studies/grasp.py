@@ -25,8 +25,9 @@ from mmgsd.fold.tasks import GRASP, GROUNDS
 from mmgsd.match.match import Match
 from mmgsd.match.matcher import Matcher, load
 from mmgsd.paths import Paths, find_root
+from mmgsd.studies.bench import Bench, Rollout, find_on_table
 from mmgsd.studies.claims import Claim, get, say
-from mmgsd.studies.folding import ROLLOUTS, Bench, Rollout, find_on_table, say_beyond, say_share
+from mmgsd.studies.folding import ROLLOUTS, say_beyond, say_share
 from mmgsd.studies.registry import Results, Shown, Study
 from mmgsd.studies.table import Table, make_page_table
 from mmgsd.symmetry import load_group

@@ -31,8 +31,8 @@ from mmgsd.measure.evaluation import read_results, write_results
 from mmgsd.paths import Paths
 from mmgsd.progress import ProgressBar
 from mmgsd.scene.stage import render_dataset
+from mmgsd.studies.bench import Bench, list_limited, measure_success
 from mmgsd.studies.claims import MARGIN, Claim, get
-from mmgsd.studies.folding import Bench, list_limited, measure_success
 from mmgsd.studies.matrix import list_missing, measure_each, train_and_measure
 from mmgsd.studies.models import ROWS, Model, configure_study, get_colour, get_label, get_line_style
 from mmgsd.studies.policies import Policy

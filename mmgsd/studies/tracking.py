@@ -34,7 +34,7 @@ from mmgsd.match.matcher import find_weights
 from mmgsd.measure.tracking import Truth, average_tracks, measure_track
 from mmgsd.paths import Paths, find_root
 from mmgsd.progress import ProgressBar
-from mmgsd.studies.folding import Bench, Rollout, read_kept
+from mmgsd.studies.bench import Bench, Rollout, read_kept
 from mmgsd.studies.registry import Results, Shown, Study
 from mmgsd.studies.table import Column, Table
 from mmgsd.symmetry import load_group

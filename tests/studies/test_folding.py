@@ -15,9 +15,18 @@ from mmgsd.fold.moves import PolicyAnswer
 from mmgsd.fold.state import State, read_state, write_state
 from mmgsd.fold.tasks import GROUNDS, TASKS
 from mmgsd.paths import Paths
-from mmgsd.studies import folding as rollouts
-from mmgsd.studies import policies
-from mmgsd.studies.folding import choose_shown, find_on_table, list_rollouts, run, summarise_rollouts
+from mmgsd.studies import bench as benches
+from mmgsd.studies import folding, policies
+from mmgsd.studies.bench import (
+    Bench,
+    choose_shown,
+    find_on_table,
+    list_limited,
+    list_rollouts,
+    measure_success,
+    summarise_rollouts,
+)
+from mmgsd.studies.folding import run
 from mmgsd.studies.policies import POLICIES, SHIPPED, digest_policy, find_answering
 from mmgsd.studies.registry import load_results
 
@@ -61,7 +70,7 @@ def physics(monkeypatch: pytest.MonkeyPatch) -> list[str]:
             write_state(files[name], lay(about["object"], about))
         return files
 
-    monkeypatch.setattr(rollouts, "run_jobs", run)
+    monkeypatch.setattr(benches, "run_jobs", run)
     return made
 
 
@@ -87,6 +96,17 @@ def test_a_run_makes_every_state_once_and_a_second_none(tmp_path: Path, physics:
     assert len(physics) == count and again["policies"] == results["policies"]
 
 
+def test_rollouts_within_a_limit_are_on_plain_ground_and_count_where_the_truth_succeeds(
+    tmp_path: Path, physics: list[str]
+) -> None:
+    rollouts = list_limited("cloth", 5, 15)
+    assert {(rollout.ground, rollout.turn_deg) for rollout in rollouts} == {("plain", 15)}
+    assert len({rollout.name for rollout in rollouts}) == 5 and all("within-15" in rollout.name for rollout in rollouts)
+    found = measure_success(Bench(tmp_path, {"progress": False}), [POLICIES["random"]], rollouts[:2])
+    assert list(found) == ["truth", "random"]
+    assert found["random"]["count"] == 0  # untouched, each is a success already
+
+
 def test_an_interrupted_run_goes_on_from_its_files(tmp_path: Path, physics: list[str]) -> None:
     run(Paths(tmp_path, "smoke"), policies=ASKED, progress=False)
     answers = sorted((tmp_path / "data/generated/smoke/folding/answers").iterdir())
@@ -109,12 +129,12 @@ def test_the_report_reads_what_a_run_wrote(tmp_path: Path) -> None:
     said = {"mean": 0.5, "low": 0.1, "high": 0.9, "count": 4}
     row = {"reachable": {"success": said}, "beyond": {"error": said}, "all": {}, "rollouts": {"a": [0.1, True]}}
     write_json(tmp_path / "folding.json", {"run": {}, "policies": {"cloth": {"mmgsd": row, "sift": {}}, "rope": {}}})
-    folding = load_results(tmp_path)["folding"]
-    assert folding == {"cloth": {"mmgsd": {"success": said, "beyond": {"error": said}}}, "rope": {}}
+    found = load_results(tmp_path)["folding"]
+    assert found == {"cloth": {"mmgsd": {"success": said, "beyond": {"error": said}}}, "rope": {}}
 
 
 def test_slides_show_each_look_and_the_end(tmp_path: Path, physics: list[str]) -> None:
-    bench = rollouts.Bench(tmp_path, {"progress": False})
+    bench = Bench(tmp_path, {"progress": False})
     kept = [rollout for rollout in list_rollouts("cloth", 8) if rollout.task in ("edge", "twice")]
     bench.roll(ASKED[:1], kept, bench.make_starts(kept))
     shown = choose_shown(kept, {})
@@ -132,7 +152,7 @@ def test_the_rollout_with_the_median_error_is_drawn() -> None:
 
 
 def test_demonstrations_are_written_as_a_users_are_read(tmp_path: Path, physics: list[str]) -> None:
-    paths = rollouts.write_demonstrations(tmp_path, progress=False)
+    paths = folding.write_demonstrations(tmp_path, progress=False)
     assert [path.stem for path in paths] == list(TASKS)
     for path in paths:
         read, task = read_demonstration(path), TASKS[path.stem]
@@ -191,8 +211,8 @@ def test_the_command_runs_shipped_weights_or_trained_models(
     told: dict, names: set[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[set[str]] = []
-    monkeypatch.setattr(rollouts, "run", lambda *_, policies, **__: asked.append({p.name for p in policies}))
-    rollouts.main("smoke", **told)
+    monkeypatch.setattr(folding, "run", lambda *_, policies, **__: asked.append({p.name for p in policies}))
+    folding.main("smoke", **told)
     assert names <= asked[0] and "nothing" not in asked[0]
     assert any("quick" in name for name in asked[0]) == ("trained" in told)
 
@@ -230,12 +250,12 @@ def test_a_policy_that_is_unsure_looks_again_and_keeps_the_surest_look(
     shares = {"": 0.4, "-look1": 0.6, "-look2": 0.5}
     policy = POLICIES["mmgsd_again"]
 
-    def say(bench: rollouts.Bench, *asked: object) -> PolicyAnswer:
+    def say(bench: Bench, *asked: object) -> PolicyAnswer:
         look = asked[3].about.get("again", 0)
         return PolicyAnswer(np.zeros((0, 2, 2)), None, shares[f"-look{look}" if look else ""])
 
-    monkeypatch.setattr(rollouts.Bench, "_ask", say)
-    bench = rollouts.Bench(tmp_path, {"progress": False})
+    monkeypatch.setattr(Bench, "_ask", say)
+    bench = Bench(tmp_path, {"progress": False})
     kept = [rollout for rollout in list_rollouts("cloth", 8) if rollout.task == "edge"][:1]
     rows = bench.roll([policy, POLICIES["mmgsd"]], kept, bench.make_starts(kept))
     assert [row["share"] for row in rows["mmgsd_again"].values()] == [0.6]
@@ -243,6 +263,6 @@ def test_a_policy_that_is_unsure_looks_again_and_keeps_the_surest_look(
     ((file, answer),) = bench.acted[policy, kept[0]]
     assert file.stem.endswith("look1") and answer.share == 0.6
     shares[""] = 0.8  # sure at once
-    bench = rollouts.Bench(tmp_path / "sure", {"progress": False})
+    bench = Bench(tmp_path / "sure", {"progress": False})
     bench.roll([policy], kept, bench.make_starts(kept))
     assert not any("look" in path.stem for path in (tmp_path / "sure" / "acts").iterdir())

@@ -13,8 +13,7 @@ from mmgsd.fold.state import read_state, write_state
 from mmgsd.fold.tasks import GROUNDS, STARTS
 from mmgsd.match.match import Match
 from mmgsd.paths import Paths
-from mmgsd.studies import folding as rollouts
-from mmgsd.studies import grasp
+from mmgsd.studies import bench, grasp
 from mmgsd.studies.grasp import choose_picks, find_middle, judge_grasp, list_grasps, summarise_grasps
 
 ABOUT = {"object": "cloth", "task": "grasp", "start": "flat", "ground": "plain", "seed": 0, "fault": "", "look": 0,
@@ -94,7 +93,7 @@ def test_a_run_lifts_what_is_grasped_at_a_corner(tmp_path: Path, monkeypatch: py
         def match(self, *_: object) -> Match:
             return answer([[50.0, 50.0], FLAT_CLOTH.xy[CORNER].tolist()], [9.0, 2.0])
 
-    for module in (grasp, rollouts):
+    for module in (grasp, bench):
         monkeypatch.setattr(module, "run_jobs", run)
     monkeypatch.setattr(grasp, "load", lambda _: Sure())
     results = json.loads(grasp.run(Paths(tmp_path, "smoke"), progress=False).read_text())
