@@ -22,7 +22,8 @@ from mmgsd.config import TrainConfig
 from mmgsd.dataset import load_dataset
 from mmgsd.images import check_mask
 from mmgsd.learn.training import train_model
-from mmgsd.match.matcher import Matcher, Pair
+from mmgsd.match.matcher import Matcher
+from mmgsd.match.pair import Pair
 from mmgsd.paths import find_samples
 
 CONFIG = TrainConfig(steps=1, batch=2, pairs=2, queries=4, input_px=64, descriptor_dim=4)

@@ -23,7 +23,7 @@ top left one (0, 0); S counts the pixels asked about, n their modes. `pip instal
 """
 PARTS = {  # title: names below `mmgsd`, of classes with all their public members
     "Loading": ("load", "read_image", "find_samples", "compute_rays"),
-    "Asking": ("match.matcher.Matcher", "match.matcher.Pair"),
+    "Asking": ("match.matcher.Matcher", "match.pair.Pair"),
     "Following": ("match.track.Tracker", "match.track.Track"),
     "Answers": ("match.match.Match", "match.match.Best", "match.describe.describe_answer"),
     "Baselines and features of others": ("match.baselines.FeatureMatcher", "match.baselines.BaselineMatcher"),

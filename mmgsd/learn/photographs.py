@@ -17,7 +17,8 @@ import torch
 from mmgsd.images import check_aspect
 from mmgsd.learn.augmentation import CACHE_SCALE, Batch, TrainingImages, rescale
 from mmgsd.match.joint import spread_places
-from mmgsd.match.matcher import Matcher, Pair
+from mmgsd.match.matcher import Matcher
+from mmgsd.match.pair import Pair
 from mmgsd.measure.photographs import ENDS, Photograph
 from mmgsd.model.heads import Outputs, look_up
 from mmgsd.model.network import compute_input_size

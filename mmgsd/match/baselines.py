@@ -22,8 +22,9 @@ from torch import Tensor
 from mmgsd.checks import check_choice
 from mmgsd.images import check_pixels, check_question
 from mmgsd.match.features import Extractor, extract_dinov2, extract_imagenet, sample_features
+from mmgsd.match.heatmap import make_match
 from mmgsd.match.match import Match
-from mmgsd.match.matcher import fill_question, make_match
+from mmgsd.match.matcher import fill_question
 from mmgsd.match.mixture import AS_IT_IS, ModeReadout, check_modes
 from mmgsd.numerics import own_numerics
 

@@ -1,12 +1,9 @@
-"""From descriptors to heatmaps, their modes and entropy; the public ``Matcher`` and its answer, the ``Match``."""
+"""The public ``Matcher``: trained weights that describe images, and answer questions about pairs of them."""
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
-import math
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,22 +12,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mmgsd.checks import check, read_flag, renamed
+from mmgsd.checks import check, renamed
 from mmgsd.config import CONTRASTIVE, OBJECTS, TrainConfig
 from mmgsd.images import check_aspect, check_mask, check_pixels, to_rgb
-from mmgsd.match.joint import join, spread_places
-from mmgsd.match.match import Match, sort_modes
-from mmgsd.match.mixture import AS_IT_IS, Mixture, ModeReadout, check_count, check_modes, fit_modes, keep_most_probable
+from mmgsd.match.heatmap import check_scales, compute_heatmap
+from mmgsd.match.match import Match
+from mmgsd.match.mixture import ModeReadout, check_modes
+from mmgsd.match.pair import Pair
 from mmgsd.match.places import Flat, Place, lay_flat, shrink_sources
 from mmgsd.model.calibration import Calibration
-from mmgsd.model.heads import Outputs, look_up, weigh_cells
-from mmgsd.model.network import (
-    compute_cell_centres,
-    compute_squared_distances,
-    find_device,
-    fit_input_size,
-    sample_descriptors,
-)
+from mmgsd.model.heads import Outputs, weigh_cells
+from mmgsd.model.network import compute_squared_distances, find_device, fit_input_size, sample_descriptors
 from mmgsd.model.weights import read_weights
 from mmgsd.numerics import own_numerics
 from mmgsd.paths import find_shipped
@@ -40,31 +32,6 @@ if TYPE_CHECKING:
 
 QUARTERS = 4  # turns of an image whose descriptors are averaged: what noise they have differs
 SIZES_PX = (16, 65536)  # of the images that a model was taught with
-
-
-def compute_heatmap(squared_distances: Tensor, *, bandwidth: float | None = None, temperature: float = 1.0) -> Tensor:
-    """Distributions over cells (..., C) from squared descriptor distances (..., C).
-
-    softmax(-d²) as in training (paper section "Symmetric Distributional Loss"); or, for descriptors of a contrastive
-    loss, which have no scale of their own, a Gaussian of ``bandwidth`` in the descriptor norm differences, normalised.
-    Either is raised to the power 1 / ``temperature``. ValueError where one of the two is not finite and above 0.
-    """
-    check_scales(bandwidth=bandwidth, temperature=temperature)
-    scale = 1.0 if bandwidth is None else 1 / (2 * bandwidth**2)
-    return torch.softmax(-scale / temperature * squared_distances, -1)
-
-
-def compute_entropy(heatmap: Tensor, cell_area: float) -> Tensor:
-    """Differential entropy in nats of the density over px: (S, C) to (S,); ln of the area it spreads over."""
-    return torch.special.entr(heatmap).sum(-1) + float(np.log(cell_area))
-
-
-def check_scales(*, bandwidth: float | None = None, temperature: float = 1.0) -> None:
-    """ValueError, which names it, for a ``bandwidth`` or a ``temperature`` that is not finite and greater than 0."""
-    for name, value in (("bandwidth", bandwidth), ("temperature", temperature)):
-        number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-        if value is not None and not (number and math.isfinite(value) and value > 0):
-            raise ValueError(f"{name} must be finite and greater than 0, got {value!r}")
 
 
 class Matcher:
@@ -355,88 +322,6 @@ class _Recent:
         return self._said[key]
 
 
-@dataclass(frozen=True, eq=False)
-class Pair:
-    """Two images and what the network says of them: each question takes a few milliseconds."""
-
-    matcher: Matcher
-    image0: np.ndarray | None  # (H0, W0, 3) uint8; None: it is asked about places
-    image1: np.ndarray  # (H1, W1, 3) uint8
-    outputs: tuple[Outputs | None, Outputs]
-    mask0: np.ndarray | None = None  # (H0, W0) bool, of the caller's
-    mask1: np.ndarray | None = None  # (H1, W1) bool
-
-    @own_numerics()
-    def match(self, xy: Any, *, n: Any = None, joint: bool = False) -> Match:
-        """As `Matcher.match`, or without ``image0`` as `Matcher.find`, with places for ``xy``."""
-        joint = read_flag("joint", joint)
-        if self.image0 is None:
-            return self._find(xy, n, joint)
-        points = check_pixels(xy, self.image0.shape[1::-1])
-        if not joint:
-            return self._match(points, n)
-        most = self.matcher.num_modes
-        count = most if n is None else n
-        check_modes(count, "n", most, " with joint")
-        match, order = self.match_everywhere(points)
-        weights = np.take_along_axis(match.weights, order, 1)
-        heavy = weights[len(points) if len(match) > len(points) else 0 :].sum(0) + 1e-9
-        return sort_modes(match[: len(points)], order[: len(points), :count], heavy[:count])
-
-    @own_numerics()
-    def match_everywhere(self, points: np.ndarray) -> tuple[Match, np.ndarray]:
-        """The answer to pixels (S, 2) of image0, then to places all over the object, and whose modes are whose.
-
-        That is an order (S + P, n) of each one's modes: its columns are members of the symmetry (`join`).
-        """
-        mask = self._find_mask()
-        places = spread_places(mask)
-        match = self._match(np.concatenate([points, places.astype(points.dtype)]), None, merge=False)
-        return match, join(match.xy, mask, match.modes, match.weights, match.spread_px, places=len(places))
-
-    def _find(self, places: Any, n: Any, joint: bool) -> Match:
-        flat, xy, counts = self.matcher.look_up_places(places, joint=joint)
-        return self.lay_beside(flat).match(xy, n=counts if n is None and not joint else n, joint=joint)
-
-    def lay_beside(self, flat: Flat) -> Pair:
-        """The same image1 beside the object laid flat (`Matcher.lay_flat`), to be asked about the latter's pixels."""
-        return dataclasses.replace(self, image0=flat.image, outputs=(flat.outputs, self.outputs[1]), mask0=flat.mask)
-
-    def _find_mask(self) -> np.ndarray:
-        """(H0, W0) bool, where image0 shows the object."""
-        if self.mask0 is not None:
-            return self.mask0
-        if self.outputs[0].mask is None:
-            raise ValueError(f"mask0 must be given for joint answers and tracks: these weights of "
-                             f"{self.matcher.config.name} do not know where the object lies")  # fmt: skip
-        return self.matcher.resize_mask(self.outputs[0].mask, self.image0.shape[1::-1]) >= 0.5
-
-    def _match(self, points: np.ndarray, n: Any, *, merge: bool = True) -> Match:
-        size0, size1 = sizes = tuple((im.shape[1], im.shape[0]) for im in (self.image0, self.image1))
-        mask1 = None if self.mask1 is None else torch.from_numpy(self.mask1)
-        cells = self.matcher.compute_heatmaps(*self.outputs, torch.from_numpy(points), size0, mask1=mask1)
-        centres = compute_cell_centres(size1, cells.shape[-2:])
-        fitted, readout = self.matcher.num_modes, self.matcher.readout
-        scale = compute_scale(size1, self.matcher.size)
-        match = make_match(self.image0, self.image1, points, cells, centres, n, fitted=fitted, readout=readout,
-                           scale=scale, merge=merge)  # fmt: skip
-        return dataclasses.replace(match, calibration=self.matcher.calibration, **self._look(match, sizes))
-
-    def _look(self, match: Match, sizes: tuple[tuple[int, int], ...]) -> dict[str, np.ndarray]:
-        """What is known of the object's presence: ``visible``, ``on_object`` and ``absent`` of a match."""
-        known, xy = {}, torch.from_numpy(match.xy)
-        visible = self.matcher.compute_visible(*self.outputs, xy, torch.from_numpy(match.modes), sizes)
-        if visible is not None:
-            known["visible"] = visible.cpu().numpy()
-        on_object = look_up(self.mask0, self.outputs[0].mask, match.xy, sizes[0])
-        if on_object is not None:
-            known["on_object"] = on_object
-        if self.mask1 is not None or self.outputs[1].presence is not None:
-            absent = 0.0 if self.mask1 is not None else float(1 - self.outputs[1].presence.sigmoid())
-            known["absent"] = np.full(len(match), absent, np.float32)
-        return known
-
-
 def take_image(
     matcher: Matcher, image: Any, mask: Any = None, name: str = "image", mask_name: str = "mask"
 ) -> tuple[np.ndarray, np.ndarray | None]:
@@ -472,45 +357,6 @@ def fill_question(question: Iterable[Any]) -> tuple[Any, Any, Any, Any, Any]:
         raise ValueError("questions must be (image0, image1, xy) or (image0, image1, xy, mask0, mask1) each, "
                          f"got {len(given)} values")  # fmt: skip
     return (*given, None, None)[:5]
-
-
-def make_match(
-    image0: np.ndarray, image1: np.ndarray, xy: np.ndarray, cells: Tensor, centres: tuple[Tensor, Tensor], n: Any, *,
-    fitted: int = 1, readout: ModeReadout = AS_IT_IS, scale: float = 1.0, merge: bool = True,
-) -> Match:  # fmt: skip
-    """The answer that heatmaps (S, h, w) with cell ``centres`` (w,), (h,) px hold, however they were made.
-
-    At least ``fitted`` modes are fitted, of which the ``n`` most probable are returned; None: as many. Unless ``merge``
-    is false, those on one spot are one (`fit_modes`). ``scale`` is
-    `compute_scale`'s, for an entropy that does not depend on the number of image1's pixels.
-    """
-    wanted = check_count(fitted if n is None else n, "n", queries=len(cells))
-    fit, entropy = read_heatmap(cells, "auto" if wanted is None else wanted.clamp(min=fitted), centres,
-                                readout=readout, merge=merge)  # fmt: skip
-    fit = fit if wanted is None else keep_most_probable(fit, wanted)
-    arrays = (t.cpu().numpy() for t in (fit.modes, fit.weights, fit.covariances, entropy, fit.outlier_mass, cells))
-    match = Match(image0, image1, xy, *arrays, scale=scale)
-    return dataclasses.replace(match, entropy=match.entropy - np.float32(2 * math.log(scale)))
-
-
-def compute_scale(size: tuple[int, int], trained: tuple[int, int]) -> float:
-    """px of an image of ``size`` by px of one that the model was ``trained`` with: the root of their areas' ratio.
-
-    As large as the network sees them: its inputs have as many pixels of one as of the other (`fit_input_size`).
-    """
-    return math.sqrt(size[0] * size[1] / (trained[0] * trained[1]))
-
-
-def read_heatmap(
-    heatmap: Tensor, n: int | str | Tensor, centres: tuple[Tensor, Tensor], **how: Any
-) -> tuple[Mixture, Tensor]:
-    """Mixtures of ``n`` modes and entropies (S,) in nats of heatmaps (S, h, w) with cell ``centres`` (w,), (h,) px.
-
-    ``how`` modes are fitted is as `fit_modes` has it.
-    """
-    xs, ys = (c.float().to(heatmap.device) for c in centres)
-    entropy = compute_entropy(heatmap.flatten(1), float((xs[1] - xs[0]) * (ys[1] - ys[0])))
-    return fit_modes(heatmap, n, xs, ys, **how), entropy
 
 
 def _check_size(size: tuple[int, int]) -> None:

@@ -23,8 +23,10 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from mmgsd.images import check_pixels, to_rgb
+from mmgsd.match.heatmap import compute_scale
 from mmgsd.match.match import LIKELY, Match
-from mmgsd.match.matcher import Matcher, Pair, compute_scale, take_image
+from mmgsd.match.matcher import Matcher, take_image
+from mmgsd.match.pair import Pair
 from mmgsd.video import open_video
 
 MEMORY = 8  # frames that a step may start from

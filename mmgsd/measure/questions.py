@@ -11,7 +11,8 @@ from torch import Tensor
 
 from mmgsd.config import EvaluateConfig
 from mmgsd.dataset import Dataset, sample_pairs
-from mmgsd.match.matcher import Matcher, read_heatmap
+from mmgsd.match.heatmap import read_heatmap
+from mmgsd.match.matcher import Matcher
 from mmgsd.match.mixture import Mixture
 from mmgsd.measure.metrics import LISTS, compute_mode_lists, compute_query_errors
 from mmgsd.model.heads import Outputs

@@ -28,8 +28,9 @@ from mmgsd.dataset_format import SPLITS
 from mmgsd.files import DamagedFileError, read_json
 from mmgsd.images import read_image
 from mmgsd.match.baselines import BaselineMatcher, FeatureMatcher
+from mmgsd.match.heatmap import read_heatmap
 from mmgsd.match.match import RADIUS_PX, Match
-from mmgsd.match.matcher import Matcher, find_weights, read_heatmap
+from mmgsd.match.matcher import Matcher, find_weights
 from mmgsd.match.mixture import AS_IT_IS, ModeReadout
 from mmgsd.match.places import NAMES
 from mmgsd.measure import uncertainty

@@ -18,8 +18,9 @@ from safetensors.numpy import save
 
 from mmgsd.dataset import Dataset
 from mmgsd.files import DamagedFileError, write_bytes
+from mmgsd.match.heatmap import read_heatmap
 from mmgsd.match.match import Match
-from mmgsd.match.matcher import Matcher, read_heatmap
+from mmgsd.match.matcher import Matcher
 from mmgsd.measure.metrics import ErrorSummary, summarise_errors
 from mmgsd.measure.shipped import PLAIN
 from mmgsd.model.network import compute_cell_centres

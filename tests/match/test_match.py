@@ -12,8 +12,8 @@ import torch
 from heatmaps import CELL_PX, CELLS, CORNERS, SIZE, draw_mixture, one_cell
 
 from mmgsd.match.describe import describe_answer
+from mmgsd.match.heatmap import make_match
 from mmgsd.match.match import Match
-from mmgsd.match.matcher import make_match
 from mmgsd.model.network import compute_cell_centres
 
 

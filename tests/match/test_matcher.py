@@ -14,9 +14,11 @@ from PIL import Image
 
 from mmgsd.config import NETWORKS, TrainConfig
 from mmgsd.dataset import load_dataset
+from mmgsd.match import heatmap as heatmaps_of
 from mmgsd.match import matcher as matching
 from mmgsd.match.baselines import BaselineMatcher
-from mmgsd.match.matcher import Matcher, compute_entropy, compute_heatmap, load, make_match, read_heatmap
+from mmgsd.match.heatmap import compute_entropy, compute_heatmap, make_match, read_heatmap
+from mmgsd.match.matcher import Matcher, load
 from mmgsd.match.mixture import Mixture, ModeReadout
 from mmgsd.measure.metrics import compute_query_errors
 from mmgsd.model.heads import Outputs
@@ -73,13 +75,13 @@ def test_a_photograph_gives_one_answer_by_path_by_pillow_and_as_pixels(
 
 
 def test_modes_are_read_as_round_as_the_training_says(matcher: Matcher, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked, fit = [], matching.fit_modes
+    asked, fit = [], heatmaps_of.fit_modes
 
     def listen(*arguments: object, readout: ModeReadout, **others: object) -> Mixture:
         asked.append(readout)
         return fit(*arguments, readout=readout, **others)
 
-    monkeypatch.setattr(matching, "fit_modes", listen)
+    monkeypatch.setattr(heatmaps_of, "fit_modes", listen)
     image = np.zeros((64, 64, 3), np.uint8)
     matcher.match(image, image, [(5, 5)])
     config = dataclasses.replace(CONFIG, roundness=0.07)

@@ -12,8 +12,9 @@ import torch
 from heatmaps import CELLS, CORNERS, SIZE, draw_mixture
 
 from mmgsd.dataset import load_dataset
+from mmgsd.match.heatmap import make_match
 from mmgsd.match.match import Match
-from mmgsd.match.matcher import load, make_match
+from mmgsd.match.matcher import load
 from mmgsd.model.calibration import LEVELS, Calibration, Gaussian, Modes, parse_calibration
 from mmgsd.model.network import compute_cell_centres
 from mmgsd.paths import find_root
