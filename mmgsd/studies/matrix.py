@@ -4,6 +4,7 @@
     python -m mmgsd run models paper --only cloth-spcl                those whose name holds that text
     python -m mmgsd run models paper --scheduler tcp://host:8786      each worker one model at a time, on its own GPU
     python -m mmgsd run models quick --seeds 3                        instead the seeds study, each model with three
+    python -m mmgsd run models paper --seeds 3 --missing              of these, what no results hold yet
     python -m mmgsd run models paper --study backbones                instead the models of one study
     python -m mmgsd run models paper --study backbones --steps 1500   each of so many steps
 
@@ -192,13 +193,15 @@ def run_matrix(
     preset, root = load_preset(paths.preset), paths.root
     tasks = choose_tasks(preset, study=study, seeds=seeds, steps=steps) if tasks is None else tasks
     done = run_tasks(tasks, preset, root, scheduler=scheduler)
+    kind = "seeds" if seeds else study
+    write = partial(write_tables, preset, root)
+    if seeds or steps:
+        write = partial(write_study_table, preset, root, kind, values=range(seeds), steps=steps)
     for name, rmse in ProgressBar(done, total=len(tasks), desc="models and baselines"):
         ProgressBar.write(f"{name}: {rmse:.1f} px")
-        if seeds or steps:
-            write_study_table(preset, root, "seeds" if seeds else study, values=range(seeds), steps=steps)
-        else:
-            write_tables(preset, root)
-    kind = "seeds" if seeds else study
+        write()
+    if not tasks:
+        write()
     return paths.results / (f"{kind}_{steps}.json" if steps else f"{kind}.json") if kind else paths.results
 
 
@@ -218,8 +221,8 @@ def write_study_table(
     """Write {object: {row: errors, and under "run" the cost}} of a study where any is done, as `write_tables` does.
 
     ``values`` are σ (px), besides the preset's, or seeds, besides those that are there. The models of other ``steps``
-    than the study's have a file of their own: backbones_1500.json. Of those compared by seeds that the study of the
-    smaller budget has as well, its rows are taken where there are no others.
+    than the study's have a file of their own: backbones_1500.json. Of those compared by seeds that the main table or
+    the study of the smaller budget has as well, their rows are taken where there are no others.
     """
     paths, file = Paths(root, preset.name), f"{study}_{steps}.json" if steps else f"{study}.json"
     stored, rows, varied = evaluation.read_results(paths.results / file, depth=2), {}, None
@@ -228,8 +231,7 @@ def write_study_table(
     elif study == "seeds":
         there = _read_keys(paths.results / file, stored, lambda key: int(key.rpartition("-")[2]))
         varied = vary_seed([*values, *there])
-    others = evaluation.read_results(paths.results / "budget.json", depth=2) if study == "seeds" else {}
-    named = {row["run"].get("model"): row for shared in others.values() for row in shared.values() if "run" in row}
+    named = _list_named(paths) if study == "seeds" else {}
     for name in OBJECTS:
         for key, model in configure_study(preset, name, study, varied, steps=steps).items():
             kept = get(stored, name, key) or named.get(model.name, {})
@@ -238,6 +240,24 @@ def write_study_table(
                 rows.setdefault(name, {})[key] = {**row, "run": run}
     if rows or stored:
         evaluation.write_results(rows, paths.results / file)
+
+
+def _list_named(paths: Paths) -> dict[str, dict[str, Any]]:
+    """{name of a model: its row, with its cost under "run"} of the smaller budget and the main table."""
+    named = {row["run"].get("model"): row for rows in evaluation.read_results(paths.results / "budget.json", depth=2)
+             .values() for row in rows.values() if "run" in row}  # fmt: skip
+    costs = evaluation.read_results(paths.results / "runs.json")
+    for name, rows in evaluation.read_results(paths.results / "rmse.json", depth=2).items():
+        runs = {method: costs.get(f"{name}-{method}", {}) for method in rows}
+        named |= {run["model"]: {**rows[method], "run": run} for method, run in runs.items() if "model" in run}
+    return named
+
+
+def drop_done(tasks: Sequence[Task], paths: Paths, file: str) -> list[Task]:
+    """Without the models whose rows a results file, the main table or that of the smaller budget holds already."""
+    stored = evaluation.read_results(paths.results / file, depth=2)
+    done = {get(row, "run", "model") for rows in stored.values() for row in rows.values()} | _list_named(paths).keys()
+    return [task for task in tasks if name_task(task) not in done]
 
 
 def _read_keys(path: Path, stored: dict[str, dict], convert: Callable[[str], float]) -> list[float]:
@@ -281,6 +301,7 @@ def main(
     study: Annotated[str, Option("instead the models of one study", choices=STUDIES)] = "",
     seeds: Annotated[int, Option("instead the models compared by seeds, each with so many")] = 0,
     steps: Annotated[int, Option(f"of those, or of the study {' or '.join(TABLES)}")] = 0,
+    missing: Annotated[bool, Option("of those with --seeds, what no results hold yet")] = False,
     scheduler: Annotated[str, Option("address of a Dask scheduler; none: this process")] = "",
 ) -> None:
     """Run the models and baselines of a preset, a line each."""
@@ -292,7 +313,11 @@ def main(
         raise ValueError(f"--study and --seeds are two different lists of models: give one, got {study!r} and {seeds}")
     given = load_preset(preset)
     tasks = [task for task in choose_tasks(given, study=study, seeds=seeds, steps=steps) if only in name_task(task)]
-    if not tasks:
+    if missing:
+        if not seeds:
+            raise ValueError("--missing must be given with --seeds")
+        tasks = drop_done(tasks, Paths(find_root(), given.name), f"seeds_{steps}.json" if steps else "seeds.json")
+    elif not tasks:
         raise ValueError(f"--only {only!r}: no model or baseline of the preset {given.name} has a name with that")
     asked = {"study": study, "seeds": seeds, "steps": steps}
     run_matrix(Paths(find_root(), given.name), tasks, **asked, scheduler=read_scheduler("--scheduler", scheduler))

@@ -84,6 +84,17 @@ def test_errors_of_several_seeds_are_written(
     write_results({"rope": {"pcl": of_budget, "spcl": {"run": {"model": "another"}}}}, written.with_name("budget.json"))
     write_study_table(preset, tmp_path, "seeds", values=[0], steps=1)  # the same model is not trained twice
     assert json.loads(written.read_text()) == {**table, "rope": {"pcl-0": of_budget}}
+    of_main = configure_study(preset, "rope", "seeds", vary_seed([0]), steps=1)["spcl-0"].name
+    write_results({"rope": {"spcl": {"rmse_mean": 4.0}}}, written.with_name("rmse.json"))
+    write_results({"rope-spcl": {"model": of_main}}, written.with_name("runs.json"))
+    write_study_table(preset, tmp_path, "seeds", values=[0], steps=1)
+    assert json.loads(written.read_text())["rope"]["spcl-0"] == {"rmse_mean": 4.0, "run": {"model": of_main}}
+    trained: list[str] = []
+    monkeypatch.setattr(matrix, "run_matrix", lambda _, tasks, **how: trained.extend(map(matrix.name_task, tasks)))
+    matrix.main("smoke", seeds=2, steps=1, missing=True)
+    every = [task.name for task in choose_tasks(preset, seeds=2, steps=1)]
+    assert trained == [name for name in every if "unimodal" not in name or "rope" in name
+                       if name not in (model, of_main)]  # fmt: skip
 
 
 @pytest.mark.parametrize(
