@@ -151,8 +151,8 @@ def describe_limits(results: Results) -> Table:
         Column("rmse", "RMSE", "RMSE px", optional=True),
         Column("found", "≤20", "pck@20px", ".0f", scale=100, optional=True),
         Column("folds", "folds", "folds", optional=True),
-        Column("p", "p", form=".3f", optional=True), Column("nearest", page="nearest match px", optional=True),
-        Column("any", "all poses", "RMSE px, all poses", optional=True),
+        Column("p", "p", form=".3f", optional=True),
+        Column("any", page="RMSE px, all poses", optional=True),
     ]  # fmt: skip
     return Table("poses, method", {"": columns}, {label: row for label, row in lines.items() if row}, OBJECTS)
 
@@ -160,10 +160,10 @@ def describe_limits(results: Results) -> Table:
 def _describe_row(results: Results, object: str, limit: int, method: str) -> dict[str, Any]:
     within = get_rows(results, object, limit)
     every = None if limit == LIMITS_DEG[-1] else _mean(get_rows(results, object, limit, "any"), method)
-    found, nearest = (_mean(within, method, measure) for measure in ("pck@20px", "nearest_mean"))
+    found = _mean(within, method, "pck@20px")
     folds = get(results, object, str(limit), f"{method}-0", "folds")
     told = folds and folds["count"] and f"{100 * folds['mean']:.0f} % of {folds['count']}"
-    return {"rmse": say_seeds(within, method), "found": found, "folds": told, "nearest": nearest, "any": every}
+    return {"rmse": say_seeds(within, method), "found": found, "folds": told, "any": every}
 
 
 def _mean(rows: Mapping[str, Results], method: str, measure: str = "rmse_mean") -> float | None:
