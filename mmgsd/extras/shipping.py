@@ -125,11 +125,11 @@ def restore_model(shipped: Path, folder: Path, config: TrainConfig) -> Path:
 
 
 def _holds(file: Path, state: dict[str, torch.Tensor], note: dict[str, str]) -> bool:
-    held, said = read_tensors(file)
+    tensors, metadata = read_tensors(file)
     return (
-        held.keys() == state.keys()
-        and said == note
-        and all(torch.equal(held[name], value) for name, value in state.items())
+        tensors.keys() == state.keys()
+        and metadata == note
+        and all(torch.equal(tensors[name], value) for name, value in state.items())
     )
 
 

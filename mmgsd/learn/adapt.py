@@ -290,14 +290,14 @@ class _Adaptation(Run):
         plain = dataclasses.replace(self.config, clutter=False)
         parts = ((self.own, drawn, plain), (self.own, drawn, cluttered), (job.kept, kept, self.config))
         batch = join_batches([make_batch(*part, rng, self.device) for part in parts])
-        said = self.network.describe(batch.image.contiguous(memory_format=torch.channels_last))
-        loss = compute_loss(self.config, said.descriptors, batch, self.permutations, self.size, self.step)
+        outputs = self.network.describe(batch.image.contiguous(memory_format=torch.channels_last))
+        loss = compute_loss(self.config, outputs.descriptors, batch, self.permutations, self.size, self.step)
         if self.config.method not in CONTRASTIVE:
-            loss = loss + compute_place_loss(self.config, said.descriptors, batch, self.tie_places(),
+            loss = loss + compute_place_loss(self.config, outputs.descriptors, batch, self.tie_places(),
                                              self.permutations, self.size, self.step)  # fmt: skip
         if self.config.heads:
             seeds = torch.Generator(self.device).manual_seed(-1 - self.config.seed * 1_000_003 - self.step)
-            loss = loss + compute_head_loss(self.network.heads, said, batch, self.permutations, self.size, seeds)
+            loss = loss + compute_head_loss(self.network.heads, outputs, batch, self.permutations, self.size, seeds)
         loss.backward()
         return loss.item()
 

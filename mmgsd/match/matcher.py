@@ -91,7 +91,7 @@ class Matcher:
             chosen = [index for index, other in enumerate(sizes) if other == size]
             small = [cv2.resize(images[index], size, interpolation=cv2.INTER_AREA) for index in chosen]
             batch = torch.from_numpy(np.stack(small)).to(self.device).permute(0, 3, 1, 2).float() / 255
-            described |= zip(chosen, self._say(batch).split(), strict=True)
+            described |= zip(chosen, self._compute_outputs(batch).split(), strict=True)
         return [described[index] for index in range(len(images))]
 
     def compute_input_size(self, image: np.ndarray, name: str = "image") -> tuple[int, int]:
@@ -111,9 +111,9 @@ class Matcher:
 
     def describe_inputs(self, batch: Tensor) -> Tensor:
         """Descriptors (B, C, h, w) of images (B, 3, H, W) in [0, 1] of the network's input size."""
-        return self._say(batch).descriptors
+        return self._compute_outputs(batch).descriptors
 
-    def _say(self, batch: Tensor) -> Outputs:
+    def _compute_outputs(self, batch: Tensor) -> Outputs:
         """The mean of what the network says of images after each quarter turn, turned back."""
         turns = (batch.rot90(k, (2, 3)).contiguous(memory_format=torch.channels_last) for k in range(self.turns))
         outputs = [self.network.describe(turned).turn(-k) for k, turned in enumerate(turns)]
@@ -121,19 +121,19 @@ class Matcher:
 
     @own_numerics()
     def compute_heatmaps(
-        self, said0: Outputs, said1: Outputs, xy: Tensor, size: tuple[int, int], *, mask1: Tensor | None = None
+        self, outputs0: Outputs, outputs1: Outputs, xy: Tensor, size: tuple[int, int], *, mask1: Tensor | None = None
     ) -> Tensor:
         """Heatmaps (S, h, w) of source px ``xy`` (S, 2) of an image of ``size``, from what `describe` made of each.
 
         They are weighted by where the second image shows the object: by ``mask1`` (H1, W1) bool, or else by the
         network's own mask, if it has one.
         """
-        source = self.sample_sources(said0, xy, size)  # (1, S, D)
-        target = said1.descriptors[-self.config.descriptor_dim :]
+        source = self.sample_sources(outputs0, xy, size)  # (1, S, D)
+        target = outputs1.descriptors[-self.config.descriptor_dim :]
         squared = compute_squared_distances(source, target.flatten(1).T[None])[0]  # (S, h * w)
         heatmap = compute_heatmap(squared, bandwidth=self.bandwidth, temperature=self.temperature)
         heatmap = heatmap.view(len(xy), *target.shape[1:])
-        weight = weigh_cells(said1, target.shape[1:], mask1)
+        weight = weigh_cells(outputs1, target.shape[1:], mask1)
         if weight is None:
             return heatmap
         weighted = heatmap * weight
@@ -142,19 +142,19 @@ class Matcher:
 
     @own_numerics()
     def compute_visible(
-        self, said0: Outputs, said1: Outputs, xy: Tensor, modes: Tensor, sizes: tuple[tuple[int, int], ...]
+        self, outputs0: Outputs, outputs1: Outputs, xy: Tensor, modes: Tensor, sizes: tuple[tuple[int, int], ...]
     ) -> Tensor | None:
         """Probability (S, n) that what lies at ``xy`` (S, 2) px is seen at each of the ``modes`` (S, n, 2) px.
 
         ``sizes`` are the two images' (width, height). 0 for modes that are NaN; None of a network without heads.
         """
-        if said1.surface is None:
+        if outputs1.surface is None:
             return None
-        there = torch.cat([said1.descriptors, said1.surface])[None]
+        there = torch.cat([outputs1.descriptors, outputs1.surface])[None]
         places = modes.to(self.device).float().nan_to_num(-0.5)
         there = sample_descriptors(there, places.flatten(0, 1)[None], sizes[1])[0].unflatten(0, modes.shape[:2])
-        channels = len(said1.descriptors)
-        source = self.sample_sources(said0, xy, sizes[0])[0][:, None]  # (S, 1, D)
+        channels = len(outputs1.descriptors)
+        source = self.sample_sources(outputs0, xy, sizes[0])[0][:, None]  # (S, 1, D)
         logits = self.network.heads.visibility(source, there[..., :channels], there[..., channels:])
         return torch.sigmoid(logits) * modes.isfinite().all(-1).to(logits.device)
 
@@ -170,13 +170,13 @@ class Matcher:
         """(H, W) float32 in [0, 1] of an image of ``size`` (width, height), from an `Outputs.mask` (h, w)."""
         return cv2.resize(logits.sigmoid().cpu().numpy(), size, interpolation=cv2.INTER_LINEAR)
 
-    def sample_sources(self, said0: Outputs, xy: Tensor, size: tuple[int, int], *, shrink: bool = True) -> Tensor:
+    def sample_sources(self, outputs0: Outputs, xy: Tensor, size: tuple[int, int], *, shrink: bool = True) -> Tensor:
         """(1, S, D) what pixels ``xy`` (S, 2) of an image of ``size`` are asked about with.
 
         That is each one's descriptor; of weights with a ``shrinkage`` drawn towards the mean descriptors of the
         places of the object that it looks like (`mmgsd.match.places.shrink_sources`), unless ``shrink`` is false.
         """
-        sources = said0.descriptors[None, : self.config.descriptor_dim]
+        sources = outputs0.descriptors[None, : self.config.descriptor_dim]
         sampled = sample_descriptors(sources, xy[None].to(self.device).float(), size)
         if not shrink or self.places is None or not self.shrinkage:
             return sampled
@@ -307,8 +307,8 @@ class Matcher:
 class _Recent:
     """What ``describe`` said of the last few images, found again by their pixels: a camera may refill one array."""
 
-    def __init__(self, describe: Callable[[list[np.ndarray]], list[Outputs]], *, kept: int = 8) -> None:
-        self._describe, self._kept, self._said = describe, kept, {}
+    def __init__(self, describe: Callable[[list[np.ndarray]], list[Outputs]], *, most: int = 8) -> None:
+        self._describe, self._most, self._outputs = describe, most, {}
 
     def describe(self, images: list[np.ndarray]) -> list[Outputs]:
         """As `Matcher.describe`."""
@@ -316,10 +316,10 @@ class _Recent:
 
     def _look_up(self, image: np.ndarray) -> Outputs:
         key = image.shape, hashlib.blake2b(image).digest()
-        self._said[key] = self._said.pop(key) if key in self._said else self._describe([image])[0]
-        if len(self._said) > self._kept:
-            del self._said[next(iter(self._said))]
-        return self._said[key]
+        self._outputs[key] = self._outputs.pop(key) if key in self._outputs else self._describe([image])[0]
+        if len(self._outputs) > self._most:
+            del self._outputs[next(iter(self._outputs))]
+        return self._outputs[key]
 
 
 def take_image(

@@ -103,12 +103,12 @@ class Tracker:
         self._on_object: np.ndarray | None = None  # (S,) of pixels
         if places is None:
             pair = matcher.prepare(image0, image0, mask0=mask0, mask1=mask0)
-            self._image0, self._said0, self._mask0 = pair.image0, pair.outputs[0], pair.mask0
+            self._image0, self._outputs0, self._mask0 = pair.image0, pair.outputs[0], pair.mask0
             self._points = check_pixels(xy, pair.image0.shape[1::-1])
             self._begin(pair)
         else:
             flat, self._points, counts = matcher.look_up_places(places, joint=True)
-            self._image0, self._said0, self._mask0 = flat.image, flat.outputs, flat.mask
+            self._image0, self._outputs0, self._mask0 = flat.image, flat.outputs, flat.mask
             self._counts = np.full(len(self._points), matcher.num_modes) if counts is None else counts
 
     def _begin(self, pair: Pair) -> None:
@@ -149,8 +149,8 @@ class Tracker:
 
     def _prepare(self, image: Any, mask: Any) -> Pair:
         image, mask = take_image(self._matcher, image, mask)
-        said = self._said0, *self._matcher.describe([image])
-        return Pair(self._matcher, self._image0, image, said, self._mask0, mask)
+        outputs = self._outputs0, *self._matcher.describe([image])
+        return Pair(self._matcher, self._image0, image, outputs, self._mask0, mask)
 
     def _weigh(self, modes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """How likely each of the maps (R, n, 2) is the first frame's, (n,), and whose the others then are, (n, n)."""

@@ -103,9 +103,9 @@ def _ask_modes(
     for first, second in ProgressBar(draw_pairs(data, config), desc="heads", disable=not progress, leave=False):
         seen = data.visible[first, points]
         xy, orbit = torch.from_numpy(data.xy[first, points[seen]]), orbits[seen]
-        said = outputs[first], outputs[second]
-        modes = read_modes(matcher, *said, xy, data.size, orbits.shape[1])[0].modes
-        visible = matcher.compute_visible(*said, xy, modes, (data.size, data.size))
+        described = outputs[first], outputs[second]
+        modes = read_modes(matcher, *described, xy, data.size, orbits.shape[1])[0].modes
+        visible = matcher.compute_visible(*described, xy, modes, (data.size, data.size))
         paired = assign_modes(modes.double().cpu().numpy(), data.xy[second][orbit].astype(float))  # of each true match
         scores.append(np.take_along_axis(visible.cpu().numpy(), paired, 1).ravel())
         true.append(data.visible[second][orbit].ravel())

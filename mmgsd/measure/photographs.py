@@ -286,8 +286,8 @@ def make_photographs_table(summary: dict[str, Any]) -> str:
     lines = [pd.DataFrame.from_dict(rows, orient="index").to_string(float_format="{:.3f}".format)]
     for name, part in whole.items():
         known = {key: part["intervals"][key] for key in ("found@5%", "spurious") if part["intervals"].get(key)}
-        said = [f"{key} {low:.2f} to {high:.2f}" for key, (low, high) in known.items()]
-        lines += [f"95 % intervals, {name}: {', '.join(said)}"] if said else []
+        intervals = [f"{key} {low:.2f} to {high:.2f}" for key, (low, high) in known.items()]
+        lines += [f"95 % intervals, {name}: {', '.join(intervals)}"] if intervals else []
     return "\n".join(lines)
 
 

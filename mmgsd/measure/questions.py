@@ -72,17 +72,17 @@ def model_answer(matcher: Matcher, data: Dataset, config: EvaluateConfig) -> Ans
 
     def answer(first: int, second: int, xy: np.ndarray, n: np.ndarray) -> tuple[Mixture, Tensor]:
         """Modes and entropies (nats) of pixels ``xy`` of the first image."""
-        said = descriptors[first], descriptors[second]
-        return read_modes(matcher, *said, torch.from_numpy(xy), data.size, torch.from_numpy(n))
+        outputs = descriptors[first], descriptors[second]
+        return read_modes(matcher, *outputs, torch.from_numpy(xy), data.size, torch.from_numpy(n))
 
     return answer
 
 
 def read_modes(
-    matcher: Matcher, said0: Outputs, said1: Outputs, xy: Tensor, size: tuple[int, int], n: int | Tensor
+    matcher: Matcher, outputs0: Outputs, outputs1: Outputs, xy: Tensor, size: tuple[int, int], n: int | Tensor
 ) -> tuple[Mixture, Tensor]:
     """``n`` modes and entropies (nats) of source pixels (S, 2), of two images of one ``size``."""
-    heatmap = matcher.compute_heatmaps(said0, said1, xy, size)
+    heatmap = matcher.compute_heatmaps(outputs0, outputs1, xy, size)
     return read_heatmap(heatmap, n, compute_cell_centres(size, heatmap.shape[-2:]), readout=matcher.readout)
 
 

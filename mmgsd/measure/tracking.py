@@ -41,17 +41,17 @@ def measure_track(xy: np.ndarray, visible: np.ndarray, truth: Truth) -> dict[str
     like = _measure_distance(xy[:, None], truth.likes, scale)[1:]
     swapped, could = (apart & (like < own[:, None])).any(1), apart.any(1)
     taken = (apart & (like <= APART_PX) & (own > APART_PX)[:, None]).any(1)
-    seen, said = truth.visible[1:], np.asarray(visible, bool)[1:]
+    seen, predicted = truth.visible[1:], np.asarray(visible, bool)[1:]
     near = own[..., None] <= THRESHOLDS_PX  # (T - 1, S, thresholds)
-    right = (near & (seen & said)[..., None]).sum((0, 1))
-    wrong = (said[..., None] & ~(near & seen[..., None])).sum((0, 1))
+    right = (near & (seen & predicted)[..., None]).sum((0, 1))
+    wrong = (predicted[..., None] & ~(near & seen[..., None])).sum((0, 1))
     deltas = near[seen].mean(0) if seen.any() else np.full(len(THRESHOLDS_PX), np.nan)
     return {
         **{f"delta@{t}px": float(delta) for t, delta in zip(THRESHOLDS_PX, deltas, strict=True)},
         "delta": float(deltas.mean()),
         "swaps": _average(swapped[seen & could]),
         "taken": _average(taken[seen & could]),
-        "occlusion": float((seen == said).mean()),
+        "occlusion": float((seen == predicted).mean()),
         "jaccard": float(np.mean(right / np.maximum(seen.sum() + wrong, 1))),
     }
 

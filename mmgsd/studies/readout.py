@@ -107,8 +107,8 @@ def _describe_all(matcher: Matcher, data: Dataset, config: EvaluateConfig) -> di
         for flipped in (False, True):
             seen = image[:, ::-1] if flipped else image
             turns = upright.describe([np.ascontiguousarray(np.rot90(seen, k)) for k in range(QUARTERS)])
-            said = [outputs.turn(-k) for k, outputs in enumerate(turns)]
-            described[int(index), flipped] = [_flip(outputs) for outputs in said] if flipped else said
+            back = [outputs.turn(-k) for k, outputs in enumerate(turns)]
+            described[int(index), flipped] = [_flip(outputs) for outputs in back] if flipped else back
     return described
 
 

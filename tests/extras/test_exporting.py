@@ -52,14 +52,14 @@ def test_the_program_of_the_docs_matches_as_the_library_does(matcher: Matcher, s
     visible = matcher.compute_visible(*pair.outputs, torch.from_numpy(xy), modes, sizes)
     np.testing.assert_allclose(said["visible"], visible[0], atol=1e-3)
     np.testing.assert_allclose(1 - said["present"], match.absent[0], atol=1e-3)
-    np.testing.assert_allclose(said["said1"]["mask"], pair.outputs[1].mask, atol=1e-2)
+    np.testing.assert_allclose(said["outputs1"]["mask"], pair.outputs[1].mask, atol=1e-2)
     apart = np.linalg.norm(said["modes"][:, None] - match.modes[0], axis=-1)
     assert apart.min(0).max() < 16 and apart.min(1).max() < 16  # px: a cell
 
 
 def test_the_difference_from_describe_is_bfloat16s(matcher: Matcher, said: dict[str, Any]) -> None:
     descriptors = matcher.describe([mmgsd.read_image(IMAGES[0])])[0].descriptors.numpy()
-    difference = np.abs(said["said0"]["descriptors"] - descriptors).max() / np.abs(descriptors).max()
+    difference = np.abs(said["outputs0"]["descriptors"] - descriptors).max() / np.abs(descriptors).max()
     assert 1e-5 < difference < 1e-2
 
 

@@ -423,7 +423,7 @@ def test_many_questions_are_taken_one_by_one(matcher: Matcher, image: np.ndarray
 
 
 def test_no_more_than_the_last_few_images_are_kept() -> None:
-    recent = matching._Recent(lambda images: [int(image[0, 0, 0]) for image in images], kept=3)
+    recent = matching._Recent(lambda images: [int(image[0, 0, 0]) for image in images], most=3)
     for value in range(20):
         recent.describe([np.full((2, 2, 3), value, np.uint8), np.zeros((2, 2, 3), np.uint8)])
     assert list(recent._said.values()) == [18, 19, 0]
