@@ -43,7 +43,7 @@ from mmgsd.studies.table import Column, Table
 LIMITS_DEG = (15, 45, 90, 180)  # of the object's turn, both ways; the last is any
 METHODS = ("mmgsd", "unimodal", "spcl", "pcl")
 SEEDS = 3
-FOLDS = 48  # rollouts within each limit
+FOLDS = 24  # rollouts within each limit
 NARROW = (15, 45)  # limits within which a pose tells the labelling: no more than half of the turn that looks alike
 
 

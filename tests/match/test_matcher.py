@@ -426,7 +426,7 @@ def test_no_more_than_the_last_few_images_are_kept() -> None:
     recent = matching._Recent(lambda images: [int(image[0, 0, 0]) for image in images], most=3)
     for value in range(20):
         recent.describe([np.full((2, 2, 3), value, np.uint8), np.zeros((2, 2, 3), np.uint8)])
-    assert list(recent._said.values()) == [18, 19, 0]
+    assert list(recent._outputs.values()) == [18, 19, 0]
 
 
 def test_a_device_that_is_not_there_is_not_the_files_fault() -> None:
