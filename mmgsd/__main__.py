@@ -57,32 +57,32 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _run(words: list[str]) -> None:
-    given = make_parser(words).parse_args(words)
-    place, _ = _list_studies()[given._study] if given._command == "run" else COMMANDS[given._command]
-    kept = KEPT
+    options = make_parser(words).parse_args(words)
+    place, _ = _list_studies()[options._study] if options._command == "run" else COMMANDS[options._command]
+    note = KEPT
     if place.startswith("cli."):
-        kept = _say_kept(given)
+        note = _describe_outputs(options)
         os.environ["MPLBACKEND"] = "Agg"  # another environment's, such as a notebook's, may be missing in this one
-    run_command(functools.partial(call, _load(place), given), kept=kept)
+    run_command(functools.partial(call, _load(place), options), kept=note)
 
 
 def _load(place: str) -> Callable[..., None]:
     place, _, study = place.partition(":")
     module, _, name = place.rpartition(".")
-    found = getattr(importlib.import_module(f"mmgsd.{module}"), name)
-    return found(study) if study else found
+    function = getattr(importlib.import_module(f"mmgsd.{module}"), name)
+    return function(study) if study else function
 
 
 def _list_studies() -> dict[str, tuple[str, str]]:
     """`STUDIES`, and all others, which have the same options; their files are read, for an import takes seconds."""
-    found = {}
+    studies = {}
     for module in pkgutil.iter_modules(importlib.import_module("mmgsd.studies").__path__):
         text = Path(module.module_finder.path, f"{module.name}.py").read_text("utf-8")
         name = re.search(r'^STUDY = Study\(\s*"(\w+)"', text, re.MULTILINE)
         line = re.match(r'"""(.*?)\.?("""|\n)', text)
         if name:
-            found[name[1]] = f"studies.registry.make_command:{name[1]}", line[1] if line else ""
-    return STUDIES | {name: place for name, place in found.items() if name not in STUDIES}
+            studies[name[1]] = f"studies.registry.make_command:{name[1]}", line[1] if line else ""
+    return STUDIES | {name: place for name, place in studies.items() if name not in STUDIES}
 
 
 def make_parser(words: list[str]) -> argparse.ArgumentParser:
@@ -120,8 +120,8 @@ def _join_negative(words: list[str]) -> list[str]:
     return joined
 
 
-def _say_kept(given: argparse.Namespace) -> str:
-    written = [str(path) for path in (getattr(given, name, None) for name in ("out", "csv")) if path]
+def _describe_outputs(options: argparse.Namespace) -> str:
+    written = [str(path) for path in (getattr(options, name, None) for name in ("out", "csv")) if path]
     if not written:
         return "there was nothing to keep"
     return f"{' and '.join(written)} {'is as it was' if len(written) == 1 else 'are as they were'} before"

@@ -193,16 +193,16 @@ def track(
     from mmgsd.progress import ProgressBar
     from mmgsd.video import open_video
 
-    shown, outputs = open_video(video), list_outputs(out)
+    clip, outputs = open_video(video), list_outputs(out)
     if video.resolve() in (path.resolve() for path in outputs):
         raise ValueError(f"--out must not be the video itself, got {out}")
-    images, frames = itertools.tee(shown)
+    images, frames = itertools.tee(clip)
     followed = mmgsd.load(weights).follow(frames, xy, find=find, mask0=mask0)
     absent, stopped = [], None
     written = " and ".join(map(str, outputs))
-    with recording(outputs, shown.rate) as record:
+    with recording(outputs, clip.rate) as record:
         try:
-            for one in ProgressBar(followed, desc="track", unit="frame", total=shown.count):
+            for one in ProgressBar(followed, desc="track", unit="frame", total=clip.count):
                 record(next(images), one)
                 absent.append(one.absent > LIKELY)
         except (Exception, KeyboardInterrupt) as error:
@@ -295,26 +295,27 @@ def fold(
     from mmgsd.fold.moves import answer_picture
     from mmgsd.match.camera import compute_rays
 
-    shown, now = read_demonstration(demonstration), mmgsd.read_image(image)
+    demo, now = read_demonstration(demonstration), mmgsd.read_image(image)
     _check_written([image], out=out)
-    answer = answer_picture(mmgsd.load(weights), shown, now, look=look, chosen=chosen, by_name=by_name)
+    answer = answer_picture(mmgsd.load(weights), demo, now, look=look, chosen=chosen, by_name=by_name)
     if out:
         from mmgsd.figures.folding import plot_moves
 
-        done = shown.looks[look]
-        save_picture(plot_moves({"demonstration": (done.image, done.moves), "now": (now, answer.moves)}), out)
-    told = {"pick": answer.moves[:, 0].round(1), "place": answer.moves[:, 1].round(1)}
+        reference = demo.looks[look]
+        pictures = {"demonstration": (reference.image, reference.moves), "now": (now, answer.moves)}
+        save_picture(plot_moves(pictures), out)
+    columns = {"pick": answer.moves[:, 0].round(1), "place": answer.moves[:, 1].round(1)}
     if intrinsics is not None:
         rays = compute_rays(answer.moves, intrinsics).round(5)
-        told |= {"pick_ray": rays[:, 0], "place_ray": rays[:, 1]}
-    moves = [{name: values[k].tolist() for name, values in told.items()} for k in range(len(answer.moves))]
+        columns |= {"pick_ray": rays[:, 0], "place_ray": rays[:, 1]}
+    moves = [{name: values[k].tolist() for name, values in columns.items()} for k in range(len(answer.moves))]
     if json:
         print(dumps({"moves": moves, "agreement": round(answer.share, 3)}), flush=True)
         return
     for move in moves:
-        told = {name: ",".join(f"{number:g}" for number in numbers) for name, numbers in move.items()}
-        rays = f" (rays {told['pick_ray']} and {told['place_ray']})" if "pick_ray" in told else ""
-        print(f"pick {told['pick']} place {told['place']}{rays}")
+        texts = {name: ",".join(f"{number:g}" for number in numbers) for name, numbers in move.items()}
+        rays = f" (rays {texts['pick_ray']} and {texts['place_ray']})" if "pick_ray" in texts else ""
+        print(f"pick {texts['pick']} place {texts['place']}{rays}")
     print(f"{answer.share:.0%} of the demonstration's pixels agree", flush=True)
 
 
@@ -358,11 +359,11 @@ def calibrate(
 
     calibrated = calibrate_weights if data else calibrate_unseen
     matcher = mmgsd.load(calibrated(weights, data or unseen, overwrite=overwrite))
-    found, readout = matcher.calibration, matcher.readout
+    calibration, readout = matcher.calibration, matcher.readout
     print(f"{weights}: modes read with power {readout.exponent:g} and sharpness {readout.mean_exponent:g}, "
           f"sources with shrinkage {matcher.shrinkage:g}; "
-          f"calibrated on {found.pairs} pairs of held-out simulations; each half by the other: "
-          f"ECE {found.ece_ellipse:.3f} of ellipses, {found.ece_confidence:.3f} of confidences")  # fmt: skip
+          f"calibrated on {calibration.pairs} pairs of held-out simulations; each half by the other: ECE "
+          f"{calibration.ece_ellipse:.3f} of ellipses, {calibration.ece_confidence:.3f} of confidences")  # fmt: skip
 
 
 def heads(
@@ -462,8 +463,8 @@ def _list_rows(name: str, described: list[dict[str, Any]]) -> Iterator[dict[str,
         shared |= {"image1": name, **dict(zip("xy", query["xy"], strict=True))}
         for k, mode in enumerate(query["modes"]):
             x1, y1 = mode["xy"]
-            told = {name: value for name, value in mode.items() if name not in ("xy", "answer")}
-            yield {**shared, "mode": mode.get("answer", k + 1), "x1": x1, "y1": y1, **told}
+            columns = {name: value for name, value in mode.items() if name not in ("xy", "answer")}
+            yield {**shared, "mode": mode.get("answer", k + 1), "x1": x1, "y1": y1, **columns}
 
 
 @contextmanager

@@ -62,10 +62,10 @@ def _read_hint(hint: Any) -> tuple[type, dict[str, Any]]:
     return (kinds[0] if kinds else kind), how
 
 
-def call(function: Callable[..., None], given: argparse.Namespace) -> None:
+def call(function: Callable[..., None], options: argparse.Namespace) -> None:
     """Call a function with what `add_arguments` had parsed for it."""
     signature = inspect.signature(function)
-    bound = inspect.BoundArguments(signature, {name: getattr(given, name) for name in signature.parameters})
+    bound = inspect.BoundArguments(signature, {name: getattr(options, name) for name in signature.parameters})
     function(*bound.args, **bound.kwargs)
 
 
@@ -139,8 +139,8 @@ def describe_error(error: BaseException) -> str:
     text = " ".join(str(error).split())
     if text and isinstance(error, ValueError | OSError | RuntimeError):
         return text
-    said = f"{type(error).__name__}: {text}" if text else type(error).__name__
-    return f"{said} (set MMGSD_TRACEBACK=1 to see where)"
+    message = f"{type(error).__name__}: {text}" if text else type(error).__name__
+    return f"{message} (set MMGSD_TRACEBACK=1 to see where)"
 
 
 def _leave(sentence: str, code: int) -> None:

@@ -290,7 +290,7 @@ def to_dict(config: Config) -> dict[str, Any]:
 
 def from_dict(kind: type[Config], values: dict[str, Any]) -> Config:
     """Build a configuration from stored values; an unknown key is a ValueError that names the accepted ones."""
-    known = [field.name for field in dataclasses.fields(kind)]
+    names = [field.name for field in dataclasses.fields(kind)]
     for key in values:
-        check_choice(f"a key of {kind.__name__}", key, tuple(known))
+        check_choice(f"a key of {kind.__name__}", key, tuple(names))
     return kind(**values)

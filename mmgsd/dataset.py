@@ -85,10 +85,10 @@ class Dataset:
 
         Data that do not name the version of their scenes are from before these were counted: of the first.
         """
-        made = {key: self.info[key] for key in ("config", "versions", "packed", "joined") if key in self.info}
-        if "versions" in made:
-            made["versions"] = {"scenes": 1, **made["versions"]}
-        text = json.dumps(list(made.values()), sort_keys=True)
+        provenance = {key: self.info[key] for key in ("config", "versions", "packed", "joined") if key in self.info}
+        if "versions" in provenance:
+            provenance["versions"] = {"scenes": 1, **provenance["versions"]}
+        text = json.dumps(list(provenance.values()), sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def group(self, name: str = "") -> SymmetryGroup:
@@ -152,10 +152,10 @@ def hold_out(data: Dataset) -> tuple[Dataset, Dataset]:
     """The split without its last simulations, and these: a twentieth, at least one; all in both if only one."""
     episodes = np.unique(data.episode)
     last = episodes[-max(1, round(len(episodes) * 0.05)) :]
-    held = data.labels.episode.isin(last)
-    if held.all():
+    held_out = data.labels.episode.isin(last)
+    if held_out.all():
         return data, data
-    parts = (data.labels[~held], data.labels[held])
+    parts = (data.labels[~held_out], data.labels[held_out])
     return tuple(dataclasses.replace(data, labels=part.reset_index(drop=True)) for part in parts)
 
 
@@ -197,12 +197,12 @@ def measure_images(data: Dataset) -> pd.DataFrame:
     object's mask, ``object_colour`` and ``background_colour``.
     """
     rows = []
-    shown = np.flatnonzero(data.present)
-    for index in shown:
+    indices = np.flatnonzero(data.present)
+    for index in indices:
         image, mask = data.load_image(index), data.load_mask(index)
         colours = {"object_colour": np.median(image[mask], 0), "background_colour": np.median(image[~mask], 0)}
         rows.append({"visible": data.visible[index].mean(), **colours})
-    state = data.labels.state.to_numpy()[shown] if "state" in data.labels else "unknown"
+    state = data.labels.state.to_numpy()[indices] if "state" in data.labels else "unknown"
     return pd.DataFrame(rows).assign(state=state)
 
 

@@ -152,8 +152,8 @@ def _check_words(path: Path, labels: pd.DataFrame) -> None:
         if pd.api.types.is_numeric_dtype(labels[column]) or column in ("xy", "visible", "intrinsics", "camera_pose"):
             continue
         pattern = patterns.get(column, WORDS)
-        given = labels[column] if column in patterns else labels[column].astype(object).fillna("")
-        wrong = [value for value in given if not _is_text(value, pattern)]
+        values = labels[column] if column in patterns else labels[column].astype(object).fillna("")
+        wrong = [value for value in values if not _is_text(value, pattern)]
         if wrong:
             raise DatasetError(f"{path}: {column} must be like {pattern.pattern}, got {_shorten(wrong[0])}: {REMEDY}")
     for column in patterns:

@@ -159,8 +159,8 @@ def remove_leftovers(folder: Path, name: str = "") -> None:
     """Remove what killed processes of this machine left in ``folder``: of the file ``name``, or of every file."""
     name = _shorten(name)
     for path in folder.glob(f".{glob.escape(name) or '*'}.*.*"):
-        found = ASIDE.fullmatch(path.name)
-        if found and (not name or found["name"] == name) and not _is_running(found["host"], int(found["pid"])):
+        parts = ASIDE.fullmatch(path.name)
+        if parts and (not name or parts["name"] == name) and not _is_running(parts["host"], int(parts["pid"])):
             _remove(path)
 
 

@@ -63,10 +63,10 @@ def list_images(folder: Path | str) -> list[Path]:
     The endings are those of all kinds that `read_image` reads. Hidden files and folders in it are left out.
     """
     paths = sorted(path for path in Path(folder).iterdir() if is_image(path))
-    found = [path for path in paths if path.is_file() and not path.name.startswith(".")]
-    if not found:
+    files = [path for path in paths if path.is_file() and not path.name.startswith(".")]
+    if not files:
         raise ValueError(f"{folder} holds no image: its files must end as images do, with .png, .jpg, .webp, .tif …")
-    return found
+    return files
 
 
 def is_image(path: Path) -> bool:
@@ -77,8 +77,8 @@ def is_image(path: Path) -> bool:
 @cache
 def _list_endings() -> set[str]:
     """Of HEIC too, so that it is said how to get it read, and of MPO, which Pillow opens as JPEG."""
-    known = Image.registered_extensions().items()
-    return {ending for ending, kind in known if kind in Image.OPEN and kind not in NO_PICTURES} | {".mpo", *HEIC}
+    formats = Image.registered_extensions().items()
+    return {ending for ending, kind in formats if kind in Image.OPEN and kind not in NO_PICTURES} | {".mpo", *HEIC}
 
 
 def decode_image(source: Path | io.BytesIO, name: str) -> np.ndarray:

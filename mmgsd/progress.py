@@ -35,7 +35,7 @@ class ProgressBar(tqdm):
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        self._last, self._said, self._lines = -EVERY, time.monotonic(), not _is_watched()
+        self._last, self._last_line, self._lines = -EVERY, time.monotonic(), not _is_watched()
         hidden = {"display": False} if issubclass(tqdm, tqdm_notebook) else {"file": Nowhere()}
         super().__init__(*args, **kwargs, **(hidden if self._lines else {}))
 
@@ -46,11 +46,11 @@ class ProgressBar(tqdm):
             _tell(f"{self.desc}: {self.n}/{self.total or '?'}")
         if not self._lines:
             return super().display(*args, **kwargs)
-        if time.monotonic() - self._said >= SAY:
+        if time.monotonic() - self._last_line >= SAY:
             self._say()
 
     def _say(self) -> None:
-        self._said = time.monotonic()
+        self._last_line = time.monotonic()
         shape = {**self.format_dict, "bar_format": LINE, "ncols": None}
         print(self.format_meter(**shape), file=sys.stderr, flush=True)
 

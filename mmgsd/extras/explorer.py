@@ -182,11 +182,11 @@ class Explorer:
         if points:
             answer = self._get_answering()
             match = answer(np.array(points), joint=True) if self._check_together() else answer(np.array(points))
-        shown = {"json": "[]", "points": []} if match is None else show_answer(match, self.scene)
+        drawing = {"json": "[]", "points": []} if match is None else show_answer(match, self.scene)
         self.milliseconds = 1000 * (time.perf_counter() - start)
         self.answers += 1
         about = {"pair": self.pairs_opened, "number": self.answers, "milliseconds": round(self.milliseconds)}
-        self.answer, self.pictures.answer = match, about | shown
+        self.answer, self.pictures.answer = match, about | drawing
         return match
 
     def _check_together(self) -> bool:
@@ -223,15 +223,15 @@ class Explorer:
 
     def _on_message(self, _: Pictures, content: dict, buffers: list) -> None:
         """Do what the browser asks for; it hears of every end, and the reader of every error, in a sentence."""
-        told = {"token": content.get("token")}
+        reply = {"token": content.get("token")}
         try:
             self._handle(content, buffers)
         except (ValueError, OSError) as error:
-            told["error"] = _to_sentence(error)
+            reply["error"] = _to_sentence(error)
         except Exception as error:
             log.exception("the explorer could not do %s", content.get("do"))
-            told["error"] = f"{type(error).__name__}: {_to_sentence(error)}"
-        self.pictures.send(told)
+            reply["error"] = f"{type(error).__name__}: {_to_sentence(error)}"
+        self.pictures.send(reply)
 
     def _handle(self, content: dict, buffers: list) -> None:
         do = content.get("do")
@@ -291,9 +291,9 @@ def show_answer(match: Match, scene: Scene) -> dict[str, Any]:
     ellipses = (describe_ellipses(match, query) for query in range(len(match.xy)))
     truth = (scene.find_truth(xy).tolist() for xy in match.xy)
     points = [{"ellipses": shapes, "matches": true} for shapes, true in zip(ellipses, truth, strict=True)]
-    shown = {"heat": np.rint(255 * heat).astype(np.uint8).tobytes(), "heat_size": list(size)}
+    heatmap = {"heat": np.rint(255 * heat).astype(np.uint8).tobytes(), "heat_size": list(size)}
     joint = [] if match.joint_weights is None else match.joint_weights.astype(float).round(4).tolist()
-    return shown | {"json": json.dumps(describe_answer(match)), "points": points, "joint": joint}
+    return heatmap | {"json": json.dumps(describe_answer(match)), "points": points, "joint": joint}
 
 
 def describe_ellipses(match: Match, query: int = 0) -> list[dict[str, float]]:
@@ -317,13 +317,13 @@ def prepare_baseline(matcher: FeatureMatcher, scene: Scene) -> Callable[..., Mat
 
     def answer(xy: np.ndarray) -> Match:
         """The answer about pixels of the whole image, from that about the small one."""
-        found = matcher.match(*small, (xy + 0.5) / ratio0 - 0.5, mask1=mask)
+        small_match = matcher.match(*small, (xy + 0.5) / ratio0 - 0.5, mask1=mask)
         back = {
-            "modes": (found.modes + 0.5) * ratio1 - 0.5,
-            "covariances": found.covariances * np.outer(ratio1, ratio1),
+            "modes": (small_match.modes + 0.5) * ratio1 - 0.5,
+            "covariances": small_match.covariances * np.outer(ratio1, ratio1),
             "scale": float(np.sqrt(ratio1.prod())),  # to the entropy and the confidence, the size is no matter
         }
-        return dataclasses.replace(found, image0=scene.image0, image1=scene.image1, xy=xy, **back)
+        return dataclasses.replace(small_match, image0=scene.image0, image1=scene.image1, xy=xy, **back)
 
     return answer
 

@@ -52,13 +52,13 @@ class Scene:
         Nothing is known of its matches any more.
         """
         other = {f"image{side}": to_rgb(image, f"image{side}"), f"name{side}": name, "xy0": None, "orbits": None}
-        kept = {"mask1": self.mask1} if side == 0 else {"mask1": None, "flat": self.flat}
-        return dataclasses.replace(self, **{"flat": False, **other, **kept})
+        fields = {"mask1": self.mask1} if side == 0 else {"mask1": None, "flat": self.flat}
+        return dataclasses.replace(self, **{"flat": False, **other, **fields})
 
     def lay_flat(self, flat: Flat) -> Scene:
         """The second image beside the object laid flat; where its matches are known, they stay known."""
-        known = {"xy0": None if self.orbits is None else flat.xy}
-        return dataclasses.replace(self, image0=flat.image, name0=f"{flat.object}, laid flat", flat=True, **known)
+        labels = {"xy0": None if self.orbits is None else flat.xy}
+        return dataclasses.replace(self, image0=flat.image, name0=f"{flat.object}, laid flat", flat=True, **labels)
 
 
 def make_scenes(data: Dataset, *, pairs: int = 50, seed: int = 0) -> list[Callable[[], Scene]]:

@@ -151,15 +151,15 @@ def _name_weights(graph: onnx.GraphProto) -> None:
     """Give layers their weights themselves: torch puts an Identity between where one is used again, and quantising
     refuses that."""
     same = {weight.name: weight.name for weight in graph.initializer}
-    kept = []
+    nodes = []
     for node in graph.node:
         if node.op_type == "Identity" and node.input[0] in same:
             same[node.output[0]] = same[node.input[0]]
         else:
             node.input[:] = [same.get(name, name) for name in node.input]
-            kept.append(node)
+            nodes.append(node)
     del graph.node[:]
-    graph.node.extend(kept)
+    graph.node.extend(nodes)
 
 
 def _halve_weights(graph: onnx.GraphProto) -> None:

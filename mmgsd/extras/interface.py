@@ -68,9 +68,9 @@ def _list_commands() -> Iterator[tuple[str, str]]:
 def _sign(thing: Any) -> str:
     """The parameters, without what their docstring says of them."""
     signature = inspect.signature(thing)
-    given = [one for name, one in signature.parameters.items() if name not in ("self", "cls")]
-    known = [one.replace(annotation=one.empty) for one in given]
-    text = str(signature.replace(parameters=known, return_annotation=signature.empty))
+    parameters = [one for name, one in signature.parameters.items() if name not in ("self", "cls")]
+    plain = [one.replace(annotation=one.empty) for one in parameters]
+    text = str(signature.replace(parameters=plain, return_annotation=signature.empty))
     return re.sub(r"=<.*? at 0x[0-9a-f]+>", "=…", text)  # of a function, which has another address each time
 
 

@@ -69,8 +69,8 @@ def make_page(matcher: Matcher, out: Path | str, *, name: str, runtime: Path | s
             export_onnx(matcher, folder / "model.onnx", half=True)
         except RuntimeError:
             export_onnx(matcher, folder / "model.onnx")
-        known = describe_model(matcher, name) | {"check": _make_check(folder / "model.onnx", matcher.least_px)}
-        write_json(folder / "model.json", known | {"samples": _copy_samples(matcher, folder)}, indent=None)
+        model = describe_model(matcher, name) | {"check": _make_check(folder / "model.onnx", matcher.least_px)}
+        write_json(folder / "model.json", model | {"samples": _copy_samples(matcher, folder)}, indent=None)
         for file in AS_THEY_ARE:
             shutil.copy(HERE / "page" / file, folder / file)
         write_text(folder / "page.js", _join(SCRIPTS))
@@ -84,7 +84,7 @@ def make_page(matcher: Matcher, out: Path | str, *, name: str, runtime: Path | s
 def describe_model(matcher: Matcher, name: str) -> dict[str, Any]:
     """What the page's scripts know of a model beside its network, as plain values."""
     config, calibration, readout = matcher.config, matcher.calibration, matcher.readout
-    known = {"name": name, "size": matcher.size, "input_size": compute_input_size(matcher.size, config.input_px),
+    model = {"name": name, "size": matcher.size, "input_size": compute_input_size(matcher.size, config.input_px),
              "input_px": config.input_px, "least_px": matcher.least_px, "dim": config.descriptor_dim,
              "modes": matcher.num_modes, "temperature": matcher.temperature, "bandwidth": matcher.bandwidth,
              "elsewhere_weight": heads.ELSEWHERE_WEIGHT, "looked_up": heads.LOOKED_UP, "beside": heads.BESIDE,
@@ -92,32 +92,32 @@ def describe_model(matcher: Matcher, name: str) -> dict[str, Any]:
              "heat_colours": np.rint(255 * HEAT).astype(int).tolist()}  # fmt: skip
     if getattr(matcher.network, "heads", None):
         judge = matcher.network.heads.judge_layers
-        known["judge"] = [[layer.weight.tolist(), layer.bias.tolist()] for layer in (judge[0], judge[2])]
+        model["judge"] = [[layer.weight.tolist(), layer.bias.tolist()] for layer in (judge[0], judge[2])]
     if places := describe_shrinkage(matcher):
-        known["places"] = places
+        model["places"] = places
     if calibration is not None:
         table = [distance for distance in calibration.radius if math.isfinite(distance)]
-        known["calibration"] = {"levels": LEVELS[: len(table)], "table": table, "powers": calibration.powers}
-    return known
+        model["calibration"] = {"levels": LEVELS[: len(table)], "table": table, "powers": calibration.powers}
+    return model
 
 
 def _make_check(network: Path, least: int) -> dict[str, Any]:
     """Some descriptors of a made-up picture, by which a browser finds out whether its GPU computes what it should."""
     numbers = np.arange(3 * least**2) * CHECK_FACTOR % CHECK_MODULUS / CHECK_MODULUS
     session = onnxruntime.InferenceSession(network, providers=["CPUExecutionProvider"])
-    (found, *_) = session.run(None, {"image": numbers.astype(np.float32).reshape(1, 3, least, least)})
-    values = found.ravel()[::CHECK_STEP]
+    (descriptors, *_) = session.run(None, {"image": numbers.astype(np.float32).reshape(1, 3, least, least)})
+    values = descriptors.ravel()[::CHECK_STEP]
     return {"factor": CHECK_FACTOR, "modulus": CHECK_MODULUS, "step": CHECK_STEP, "values": values.tolist(),
-            "tolerance": CHECK_TOLERANCE * float(np.abs(found).max())}  # fmt: skip
+            "tolerance": CHECK_TOLERANCE * float(np.abs(descriptors).max())}  # fmt: skip
 
 
 def describe_mixture(readout: mixture.ModeReadout) -> dict[str, Any]:
     """How ``page/mixture.js`` fits, so that it is `mmgsd.match.mixture.fit_modes`."""
     names = {"annealing", "annealing_cycles", "cycles", "leap", "spread", "min_variance", "collapsed", "even",
              "prior_weight", "ellipse"}  # fmt: skip
-    known = {name: getattr(mixture, name.upper()) for name in sorted(names)}
-    known |= {"tolerance": mixture.TOLERANCE_CELLS, "kernel": mixture.KERNEL_CELLS}
-    return known | {"roundness": readout.shape_prior, "power": readout.exponent, "sharpness": readout.mean_exponent}
+    settings = {name: getattr(mixture, name.upper()) for name in sorted(names)}
+    settings |= {"tolerance": mixture.TOLERANCE_CELLS, "kernel": mixture.KERNEL_CELLS}
+    return settings | {"roundness": readout.shape_prior, "power": readout.exponent, "sharpness": readout.mean_exponent}
 
 
 def _copy_samples(matcher: Matcher, folder: Path) -> list[str]:

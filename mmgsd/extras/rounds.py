@@ -103,12 +103,12 @@ def _keep_curve(root: Path, object: str, number: int, weights: Path, errors: dic
     _keep(root, object, number, rmse_px=curve, run=describe_run(weights), **errors)
 
 
-def _keep(root: Path, object: str, number: int, **found: Any) -> None:
-    """Add what was found to the row of a round."""
+def _keep(root: Path, object: str, number: int, **results: Any) -> None:
+    """Add results to the row of a round."""
     file = root / "data" / "results" / RESULTS
     rows: dict[str, Any] = read_results(file, depth=2)
     row = rows.setdefault(object, {}).get(str(number), {})
-    rows[object][str(number)] = row | found
+    rows[object][str(number)] = row | results
     write_json(file, {name: dict(sorted(rows[name].items())) for name in OBJECTS if name in rows})
 
 
@@ -116,9 +116,9 @@ def measure_round(root: Path, object: str, number: int, folder: Path) -> dict[st
     """What a round finds in photographs (`measure_answers`), read as the shipped weights are; kept with it."""
     matcher = load(_find_file(root, object, number))
     matcher.readout = load(object).readout
-    found = measure_answers(matcher, read_photographs(folder, object))
-    _keep(root, object, number, photographs=found)
-    return found
+    measured = measure_answers(matcher, read_photographs(folder, object))
+    _keep(root, object, number, photographs=measured)
+    return measured
 
 
 def ship_rounds(root: Path, object: str, *, workers: int = 0) -> Path:

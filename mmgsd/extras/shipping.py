@@ -86,8 +86,8 @@ def _describe_errors(measured: dict[str, dict]) -> str:
     """Rows of the card's table."""
     lines = [ERRORS.format(where=where, **row) for where, row in measured.items() if where != "photographs"]
     if photographs := measured.get("photographs"):
-        found = 100 * photographs["found@5%"]
-        lines.append(PHOTOGRAPHS.format(photographs=photographs["photographs"], found=found))
+        percent = 100 * photographs["found@5%"]
+        lines.append(PHOTOGRAPHS.format(photographs=photographs["photographs"], found=percent))
     return "\n".join(lines) or NOT_MEASURED
 
 

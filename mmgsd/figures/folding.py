@@ -53,8 +53,8 @@ def plot_rollouts(pictures: Mapping[str, Mapping[str, np.ndarray]]) -> Figure:
             axis.set(xticks=[], yticks=[])
             axis.spines[:].set_visible(False)
         line[0].set_ylabel(fill(task, WRAPPED), fontsize=6)
-    for axis, shown in zip(axes[0], columns, strict=True):
-        axis.set_title(fill(shown, max(6, ACROSS // len(columns)), break_long_words=False), fontsize=6)
+    for axis, title in zip(axes[0], columns, strict=True):
+        axis.set_title(fill(title, max(6, ACROSS // len(columns)), break_long_words=False), fontsize=6)
     plt.close(figure)  # a notebook shows what a cell returns; an open figure would appear twice
     return figure
 

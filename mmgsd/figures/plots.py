@@ -44,8 +44,8 @@ def plot_match(match: Match, index: int = 0) -> Figure:
     style.show_source(axes[0, 0], match, index)
     style.show_answer(axes[0, 1], match, index)
     axes[0, 0].set_title("Source")
-    said = textwrap.fill(match.say_presence(index), TITLE)
-    axes[0, 1].set_title(said or f"Matches · entropy {match.entropy[index]:.1f} nats")
+    presence = textwrap.fill(match.say_presence(index), TITLE)
+    axes[0, 1].set_title(presence or f"Matches · entropy {match.entropy[index]:.1f} nats")
     return figure
 
 
@@ -70,8 +70,8 @@ def plot_page(match: Match, names: Sequence[str] = ()) -> Figure:
         style.show_answer(answer, small, index)
         x, y = match.xy[index]
         source.set_title(names[index] if names else f"{index + 1} · pixel {x:g}, {y:g}")
-        said = match.say_presence(index).partition(":")[0]  # a panel has room for a word
-        answer.set_title(said or f"entropy {match.entropy[index]:.1f} nats")
+        presence = match.say_presence(index).partition(":")[0]  # a panel has room for a word
+        answer.set_title(presence or f"entropy {match.entropy[index]:.1f} nats")
     return figure
 
 

@@ -146,10 +146,10 @@ def _run_missing(client: Client, jobs: dict[str, dict], files: dict[str, Path], 
     tasks = {batch[0]: {name: (jobs[name], before.get(name)) for name in batch} for batch in batches}
     bar = ProgressBar(total=len(names), desc="fold", unit="state", disable=not progress)
     with bar, run_tasks(client, _make_batch, tasks, retries=1) as results:
-        for _, made in results:
-            for name, data in made.items():
+        for _, states in results:
+            for name, data in states.items():
                 write_bytes(files[name], data)
-            bar.update(len(made))
+            bar.update(len(states))
 
 
 def _make_batch(jobs: dict[str, tuple[dict, bytes | None]]) -> dict[str, bytes]:

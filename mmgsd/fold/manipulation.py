@@ -138,7 +138,7 @@ def act(state: State, job: dict[str, Any]) -> State:
 
 
 def _carry(state: State, moves: Moves) -> tuple[Sequence[np.ndarray], np.ndarray, list[int]]:
-    """Vertices (V, 3) m while all ``moves`` (px) are made at once, those afterwards, and which grippers hold."""
+    """Vertices (V, 3) m while all ``moves`` (px) are made at once, those afterwards, and which of them are grasped."""
     before, thickness = state.vertices.astype(float), state.about["thickness"]
     if state.about["object"] == "cloth":
         grasps = _grasp_cloth(before, state.camera, moves)
@@ -241,16 +241,16 @@ def film(state: State, job: dict[str, Any]) -> State:
     """Looks of a motion from a state on, as one state whose arrays have an axis of frames; ``fault`` as in `act`."""
     about = state.about | {"mark": job["mark"], "size": job["size"]}
     if job["motion"] in ("turn", "hand"):
-        paths, held = _turn_half(state.vertices.astype(float), job["frames"]), []
+        paths, grasped = _turn_half(state.vertices.astype(float), job["frames"]), []
     else:
-        passed, _, held = _carry(state, job["moves"])
+        passed, _, grasped = _carry(state, job["moves"])
         paths = np.stack([state.vertices, *passed])
         paths = paths[np.linspace(0, len(paths) - 1, job["frames"]).round().astype(int)]
     if not np.isfinite(paths).all():
         paths, about["fault"] = np.repeat(state.vertices[None], len(paths), 0), "nowhere"
     looks = []
     for share, vertices in zip(np.linspace(0, 1, len(paths)), paths, strict=True):
-        tips = _find_tips(job["motion"], share, state.first, vertices[held])
+        tips = _find_tips(job["motion"], share, state.first, vertices[grasped])
         looks.append(_look(vertices.astype(np.float32), state.first, about, tips=tips))
     fixed = {"first", "intrinsics", "camera_pose", "about"}
     arrays = {field.name: np.stack([getattr(look, field.name) for look in looks])
@@ -264,10 +264,10 @@ def _turn_half(vertices: np.ndarray, frames: int) -> np.ndarray:
     return np.stack([(vertices - middle) @ spin(angle).T + middle for angle in np.pi * np.linspace(0, 1, frames)])
 
 
-def _find_tips(motion: str, share: float, first: np.ndarray, held: np.ndarray) -> list[tuple[str, np.ndarray]]:
+def _find_tips(motion: str, share: float, first: np.ndarray, places: np.ndarray) -> list[tuple[str, np.ndarray]]:
     """Where (3,) m the tips of grippers or of a hand are when a ``share`` of a film is over, each after its kind."""
     if motion == "gripper":
-        return [("gripper", place) for place in held]
+        return [("gripper", place) for place in places]
     if motion != "hand":
         return []
     low, high = first[:, :2].min(0), first[:, :2].max(0)

@@ -81,8 +81,8 @@ def estimate_share(values: Sequence[bool]) -> dict[str, float | int | None]:
     """
     if not len(values):
         return _summarise(0, None, None, None)
-    found = binomtest(int(np.sum(values)), len(values))
-    return _summarise(len(values), found.statistic, *found.proportion_ci(method="wilson"))
+    result = binomtest(int(np.sum(values)), len(values))
+    return _summarise(len(values), result.statistic, *result.proportion_ci(method="wilson"))
 
 
 def _summarise(count: int, *numbers: float | None) -> dict[str, float | int | None]:

@@ -24,9 +24,9 @@ from mmgsd.match.match import Match
 from mmgsd.match.matcher import Matcher
 
 Plane = Callable[[np.ndarray], np.ndarray]  # pixels (…, 2) to places (…, 2) of the plane that motions are in
-AGREE, BEST, JOINT = "agree", "best", "joint"  # how one mode of each question is chosen
-RIGID = 0.7  # share of the questions that agree where an object lies as it was shown
-LEAST = 0.5  # share of the questions that must agree before a picture of a user's is answered
+AGREE, BEST, JOINT = "agree", "best", "joint"  # how one mode of each query is chosen
+RIGID = 0.7  # share of the queries that agree where an object lies as it was shown
+LEAST = 0.5  # share of the queries that must agree before a picture of a user's is answered
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,11 +35,11 @@ class PolicyAnswer:
 
     moves: np.ndarray
     motion: Motion | None
-    share: float  # of the questions that agree with the motion
+    share: float  # of the queries that agree with the motion
 
 
 def choose_moves(
-    look: Look, match: Match, chosen: str, seen: Plane, shown: Plane, *, motion: Motion | None = None,
+    look: Look, match: Match, chosen: str, look_to_plane: Plane, image_to_plane: Plane, *, motion: Motion | None = None,
     free_scale: bool = False,
 ) -> PolicyAnswer:  # fmt: skip
     """Picks and places from the matches of a look's picks and anchors (`Look.asked`).
@@ -50,26 +50,26 @@ def choose_moves(
     each pick its nearest mode. "best": each pixel's `Match.best`, and the motion that fits them all; "joint" the same,
     for a ``match`` that is joint: all take the same member of the symmetry. Places are where the motion takes them.
     """
-    asked, modes = seen(look.asked), shown(match.modes)
-    picks, places = seen(look.moves[:, 0]), seen(look.moves[:, 1])
+    queries, modes = look_to_plane(look.asked), image_to_plane(match.modes)
+    picks, places = look_to_plane(look.moves[:, 0]), look_to_plane(look.moves[:, 1])
     if chosen in (BEST, JOINT):
-        surest = shown(match.best().xy)
-        known = np.isfinite(surest).all(1)
-        if not known[: len(picks)].all() or known.sum() < 2:
+        surest = image_to_plane(match.best().xy)
+        finite = np.isfinite(surest).all(1)
+        if not finite[: len(picks)].all() or finite.sum() < 2:
             return PolicyAnswer(np.zeros((0, 2, 2)), None, 0.0)
-        motion = fit_motion_to(asked[known], surest[known], free_scale=free_scale)
-        return PolicyAnswer(np.stack([surest[: len(picks)], motion.apply(places)], 1), motion, float(known.mean()))
+        motion = fit_motion_to(queries[finite], surest[finite], free_scale=free_scale)
+        return PolicyAnswer(np.stack([surest[: len(picks)], motion.apply(places)], 1), motion, float(finite.mean()))
     share, bent = 1.0, False
     if motion is None:
-        consensus = find_consensus(asked, modes, match.weights, free_scale=free_scale)
+        consensus = find_consensus(queries, modes, match.weights, free_scale=free_scale)
         if consensus is None:
             return PolicyAnswer(np.zeros((0, 2, 2)), None, 0.0)
         motion, share = consensus
         bent = share < RIGID
     if bent:
-        motion = refine_motion(asked, modes, motion, free_scale=free_scale)
+        motion = refine_motion(queries, modes, motion, free_scale=free_scale)
     wanted = motion.apply(picks)  # (M, 2)
-    radius = RADIUS * find_extent(asked) * abs(motion.factor)
+    radius = RADIUS * find_extent(queries) * abs(motion.factor)
     grasped = assign_grasps(picks, modes[: len(picks)], motion, min_distance=radius)
     reach = np.inf if bent else 2 * radius
     with np.errstate(invalid="ignore"):
@@ -108,19 +108,19 @@ def answer_picture(
         raise ValueError(f"weights must be of the demonstration's object {demonstration.object!r}, got weights of "
                          f"{matcher.object!r}")  # fmt: skip
     check_choice("chosen", chosen, (AGREE, BEST, JOINT))
-    shown = demonstration.looks[look]
-    match = match_look(matcher, shown, image, by_name=read_flag("by_name", by_name), joint=chosen == JOINT)
+    reference = demonstration.looks[look]
+    match = match_look(matcher, reference, image, by_name=read_flag("by_name", by_name), joint=chosen == JOINT)
     if match.on_object is not None and (match.on_object < 0.5).any():
-        off = shown.asked[match.on_object < 0.5].tolist()
+        off = reference.asked[match.on_object < 0.5].tolist()
         raise ValueError(f"picks and anchors must be on the object of the demonstration, these are not: {off}")
     if match.absent is not None and match.absent[0] > 0.5:
         raise ValueError(f"the picture must show a {demonstration.object}, none is seen in it")
-    zoom = _estimate_zoom(matcher, shown, match, by_name=by_name)
-    answer = choose_moves(shown, match, chosen, lambda xy: zoom * xy, np.asarray, free_scale=True)
+    zoom = _estimate_zoom(matcher, reference, match, by_name=by_name)
+    answer = choose_moves(reference, match, chosen, lambda xy: zoom * xy, np.asarray, free_scale=True)
     if answer.share < LEAST:
         raise ValueError(f"the picture's answers must agree with the demonstration, {answer.share:.0%} of them do: "
                          "take it from where the demonstration was taken, or add anchors")  # fmt: skip
-    if find_extent(answer.moves[:, 0]) * MAX_FREE_SCALE < zoom * find_extent(shown.moves[:, 0]):
+    if find_extent(answer.moves[:, 0]) * MAX_FREE_SCALE < zoom * find_extent(reference.moves[:, 0]):
         raise ValueError("the picture's answers to the picks must lie apart as these do, chosen by "
                          f"{chosen!r} they are at one place, {answer.moves[0, 0].round().tolist()}: choose another of "
                          f"{[AGREE, JOINT]}")  # fmt: skip

@@ -101,24 +101,24 @@ def adapt(
     overwrite, progress, out = read_flag("overwrite", overwrite), read_flag("progress", progress), Path(out)
     source = find_weights(weights)
     start = Matcher.load(source, device=find_device(device))
-    all_known = start.config.method not in MATCHES_OF_ONE
-    check("weights", start.config.method, "of a method that is taught all matches", all_known)
+    all_matches = start.config.method not in MATCHES_OF_ONE
+    check("weights", start.config.method, "of a method that is taught all matches", all_matches)
     kind = start.object or start.config.object
     photographs = measured.read_all_photographs(folder, kind)
     if len(photographs) < 2:  # nothing that is learnt from a single one need hold in another
         raise ValueError(f"folder must hold at least two photographs of kind {kind!r}, got {len(photographs)}")
-    asked = _describe_asked(source, photographs, renders, steps=steps, folds=folds, seed=seed)
-    if not overwrite and _is_finished(out, asked, source):
+    provenance = _describe_provenance(source, photographs, renders, steps=steps, folds=folds, seed=seed)
+    if not overwrite and _is_finished(out, provenance, source):
         return out
     work = out.with_name(f"{out.stem}.adapting")
     with files.locked(work, "adapting"), repeatable(start.device):
-        job = _Job(start, photographs, _load_renders(kind, renders), work, asked, progress)
-        if (work / ASKED).is_file() and files.read_json(work / ASKED) != asked:
+        job = _Job(start, photographs, _load_renders(kind, renders), work, provenance, progress)
+        if (work / ASKED).is_file() and files.read_json(work / ASKED) != provenance:
             files.remove_folder(work, _is_ours)
-        files.write_json(work / ASKED, asked)
+        files.write_json(work / ASKED, provenance)
         with files.saying_what_stays(lambda: f"what was learnt is kept in {work}: the same call goes on"):
-            found = job.measure()
-            job.finish(out, source, found)
+            results = job.measure()
+            job.finish(out, source, results)
         files.remove_folder(work, _is_ours)
     return out
 
@@ -131,17 +131,19 @@ def read_adaptation(weights: Path | str) -> dict[str, Any]:
     return json.loads(note["adapted"])
 
 
-def _describe_asked(source: Path, photographs: Sequence[Photograph], renders: Any, **asked: int) -> dict[str, Any]:
+def _describe_provenance(
+    source: Path, photographs: Sequence[Photograph], renders: Any, **settings: int
+) -> dict[str, Any]:
     """What decides the result: the same asked again is not done again."""
     pixels = hashlib.sha256()
     for photograph in photographs:
         pixels.update(photograph.path.read_bytes())
     marks = {"marks_digest": measured.digest_marks(list(photographs)), "files_digest": pixels.hexdigest()[:16]}
     weights = {"source": source.name, "sha256": hashlib.sha256(source.read_bytes()).hexdigest()}
-    return {**weights, **marks, **asked, **({"renders": str(renders)} if renders else {})}
+    return {**weights, **marks, **settings, **({"renders": str(renders)} if renders else {})}
 
 
-def _is_finished(out: Path, asked: dict[str, Any], source: Path) -> bool:
+def _is_finished(out: Path, provenance: dict[str, Any], source: Path) -> bool:
     """Whether ``out`` holds what is asked for; ValueError where it holds anything else."""
     card = out.with_suffix(".md")
     check("out", str(out), "a path that ends with .safetensors, and not the weights to go on from",
@@ -150,7 +152,7 @@ def _is_finished(out: Path, asked: dict[str, Any], source: Path) -> bool:
         raise files.ForeignFileError(f"{card} is no card of {out.name}: move it away, or choose another name")
     if not out.is_file():
         return False
-    if json.loads(load_metadata(out).get("adapted", "{}")).get("asked") != asked:
+    if json.loads(load_metadata(out).get("adapted", "{}")).get("asked") != provenance:
         raise ValueError(f"{out} was made of other photographs, weights or settings: choose another out, or "
                          "overwrite=True")  # fmt: skip
     return True
@@ -181,21 +183,21 @@ class _Job:
 
     def __init__(
         self, start: Matcher, photographs: list[Photograph], renders: dict[str, Dataset], work: Path,
-        asked: dict[str, Any], progress: bool,
+        provenance: dict[str, Any], progress: bool,
     ) -> None:  # fmt: skip
         self.start, self.photographs, self.renders = start, photographs, renders
-        self.work, self.asked, self.progress = work, asked, progress
+        self.work, self.provenance, self.progress = work, provenance, progress
         train, config = renders["train"], start.config
         self.own, self.permutations = prepare_photographs(photographs, start, train.group(config.group))
-        self.kept = add_points(load_training_images(train, config.input_px), self.permutations.shape[1])
+        self.render_images = add_points(load_training_images(train, config.input_px), self.permutations.shape[1])
         if start.places is None or len(start.places) != train.n_points:
             start.places = describe_places(start, train)
         self.marked = [k for k, photograph in enumerate(photographs) if len(photograph.xy)]
-        parts, steps = min(asked["folds"], len(self.marked)), asked["steps"]
+        parts, steps = min(provenance["folds"], len(self.marked)), provenance["steps"]
         self.parts = parts if parts > 1 else 0
         self.stops = [round(steps * k / STOPS) for k in range(STOPS + 1)]
         self.config = dataclasses.replace(
-            config, steps=steps, seed=asked["seed"], learning_rate=RATE, optimiser="adamw", schedule="cosine",
+            config, steps=steps, seed=provenance["seed"], learning_rate=RATE, optimiser="adamw", schedule="cosine",
             groups=1, sigma_px=SIGMA_PX, sigma_start_px=SIGMA_PX, augment=True, strong=False,  # own textures stay
         )  # fmt: skip
 
@@ -203,7 +205,7 @@ class _Job:
         """Of each part that is left out, what is found in it after each number of steps; [] where none is."""
         if not self.parts:
             return []
-        order = np.random.default_rng(self.asked["seed"]).permutation(self.marked)
+        order = np.random.default_rng(self.provenance["seed"]).permutation(self.marked)
         parts = np.array_split(order, self.parts)
         return [self._measure_part(number, sorted(part)) for number, part in enumerate(parts)]
 
@@ -222,19 +224,19 @@ class _Job:
                     rows = ask_left_out(matcher, sources, targets).to_dict("records")
                     rmse_px = measure_rmse(matcher, self.renders["test"], **QUESTIONS)
                     files.write_json(file, {"rows": rows, "rmse_px": rmse_px}, indent=None)
-        found = {stop: files.read_json(file) for stop, file in results.items()}
-        return {stop: Found(pd.DataFrame(values["rows"]), values["rmse_px"]) for stop, values in found.items()}
+        records = {stop: files.read_json(file) for stop, file in results.items()}
+        return {stop: Found(pd.DataFrame(values["rows"]), values["rmse_px"]) for stop, values in records.items()}
 
     def advance(self, run: _Adaptation, stop: int, name: str) -> None:
         """Take the steps that are left to ``stop``."""
-        shown = {"initial": run.step, "total": self.stops[-1], "disable": not self.progress, "leave": False}
-        bar = ProgressBar(range(run.step, stop), desc=name, **shown)
+        options = {"initial": run.step, "total": self.stops[-1], "disable": not self.progress, "leave": False}
+        bar = ProgressBar(range(run.step, stop), desc=name, **options)
         for _ in bar:
             bar.set_postfix(loss=f"{run.advance():.3f}", refresh=False)
 
-    def finish(self, out: Path, source: Path, found: list[dict[int, Found]]) -> None:
+    def finish(self, out: Path, source: Path, results: list[dict[int, Found]]) -> None:
         """Learn from all photographs, calibrate, and write card and weights, the weights last."""
-        taken = choose_stop(found) if found else self.stops[-1]
+        taken = choose_stop(results) if results else self.stops[-1]
         run = _Adaptation(self, list(range(len(self.photographs))), self.work / "all")
         run.resume()
         self.advance(run, taken, "adapt")
@@ -248,15 +250,15 @@ class _Job:
             note |= {} if calibration is None else {"calibration": calibration.to_json()}
             new = {**matcher.network.state_dict(), PLACES: matcher.places}
             tensors = {name: value.detach().cpu().to(tensors.get(name, value).dtype) for name, value in new.items()}
-        told = {
-            "asked": self.asked, "photographs": len(self.photographs), "marked": len(self.marked),
+        summary = {
+            "asked": self.provenance, "photographs": len(self.photographs), "marked": len(self.marked),
             "marks": sum(len(photograph.xy) for photograph in self.photographs),
-            "renders": len(self.renders["train"]), "steps": taken, "rmse_px": rmse, "folds": len(found),
-            "found": summarise_change(found), "seconds": round(run.seconds, 1),
+            "renders": len(self.renders["train"]), "steps": taken, "rmse_px": rmse, "folds": len(results),
+            "found": summarise_change(results), "seconds": round(run.seconds, 1),
             "hardware": name_hardware(self.start.device),
         }  # fmt: skip
-        files.write_text(out.with_suffix(".md"), make_card(out.name, told))
-        write_tensors(out, tensors, note | {"adapted": json.dumps(told)})
+        files.write_text(out.with_suffix(".md"), make_card(out.name, summary))
+        write_tensors(out, tensors, note | {"adapted": json.dumps(summary)})
 
 
 class _Adaptation(Run):
@@ -285,10 +287,11 @@ class _Adaptation(Run):
         seed, count, job = (self.config.seed, self.step, group), len(self.chosen), self.job
         rng = np.random.default_rng(seed)
         drawn = rng.choice(count, DRAWN, count < DRAWN, p=self.share)
-        kept = rng.choice(len(job.kept.images), RENDERS, len(job.kept.images) < RENDERS)
+        renders = job.render_images
+        drawn_renders = rng.choice(len(renders.images), RENDERS, len(renders.images) < RENDERS)
         cluttered = dataclasses.replace(self.config, clutter=job.start.config.heads)  # by masks, which it then tells
         plain = dataclasses.replace(self.config, clutter=False)
-        parts = ((self.own, drawn, plain), (self.own, drawn, cluttered), (job.kept, kept, self.config))
+        parts = ((self.own, drawn, plain), (self.own, drawn, cluttered), (renders, drawn_renders, self.config))
         batch = join_batches([make_batch(*part, rng, self.device) for part in parts])
         outputs = self.network.describe(batch.image.contiguous(memory_format=torch.channels_last))
         loss = compute_loss(self.config, outputs.descriptors, batch, self.permutations, self.size, self.step)
@@ -313,7 +316,7 @@ class _Adaptation(Run):
         return matcher
 
     def _describe_config(self) -> str:
-        return json.dumps([self.job.asked, dataclasses.asdict(self.config), self.chosen], sort_keys=True)
+        return json.dumps([self.job.provenance, dataclasses.asdict(self.config), self.chosen], sort_keys=True)
 
 
 def ask_left_out(matcher: Matcher, sources: list[Photograph], targets: list[Photograph]) -> pd.DataFrame:
@@ -324,55 +327,55 @@ def ask_left_out(matcher: Matcher, sources: list[Photograph], targets: list[Phot
     return pd.concat(tables, ignore_index=True)
 
 
-def choose_stop(found: Sequence[dict[int, Found]]) -> int:
+def choose_stop(results: Sequence[dict[int, Found]]) -> int:
     """The number of steps after which most is found at 5 % less what is spurious; the least of several.
 
-    ``found`` {steps: what is found} of each part that was left out: all photographs weigh the same. Numbers after which
-    the error on renders has grown by more than `GROWTH` are left out.
+    ``results`` {steps: what is found} of each part that was left out: all photographs weigh the same. Numbers after
+    which the error on renders has grown by more than `GROWTH` are left out.
     """
-    errors = {stop: np.mean([part[stop].rmse_px for part in found]) for stop in found[0]}
+    errors = {stop: np.mean([part[stop].rmse_px for part in results]) for stop in results[0]}
     scores = {}
     for stop in (stop for stop, error in errors.items() if error <= (1 + GROWTH) * errors[0]):
-        rows = pd.concat([part[stop].rows for part in found])
+        rows = pd.concat([part[stop].rows for part in results])
         means = rows.groupby(["by", "file"])[["found@5%", "spurious"]].mean()
         scores[stop] = float((means["found@5%"] - means["spurious"]).groupby("by").mean().mean())
     return max(scores, key=lambda stop: (scores[stop], -stop))
 
 
-def summarise_change(found: Sequence[dict[int, Found]]) -> dict[str, Any]:
+def summarise_change(results: Sequence[dict[int, Found]]) -> dict[str, Any]:
     """{by: {"before", "after": means and intervals, "change": its intervals}}; {} where nothing was left out.
 
     "After" is after as many steps as the other parts choose: the number is not chosen by what it is measured on.
     """
-    if not found:
+    if not results:
         return {}
-    stops = [choose_stop([other for other in found if other is not part]) for part in found]
-    before = pd.concat([part[0].rows for part in found], ignore_index=True)
-    after = pd.concat([part[stop].rows for part, stop in zip(found, stops, strict=True)], ignore_index=True)
+    stops = [choose_stop([other for other in results if other is not part]) for part in results]
+    before = pd.concat([part[0].rows for part in results], ignore_index=True)
+    after = pd.concat([part[stop].rows for part, stop in zip(results, stops, strict=True)], ignore_index=True)
     change = after.assign(**{name: after[name] - before[name] for name in measured.MEASURES})
     summary, keys, tables = {}, (*measured.MEASURES, "queries", "intervals"), {"before": before, "after": after}
     for by in before["by"].unique():
         rows = {name: measured.summarise_photographs(table[table["by"] == by]) for name, table in tables.items()}
-        kept = {name: {key: row[key] for key in keys} for name, row in rows.items()}
-        summary[str(by)] = {**kept, "change": measured.estimate_intervals(change[change["by"] == by])}
+        selected = {name: {key: row[key] for key in keys} for name, row in rows.items()}
+        summary[str(by)] = {**selected, "change": measured.estimate_intervals(change[change["by"] == by])}
     return summary
 
 
-def make_card(name: str, told: dict[str, Any]) -> str:
+def make_card(name: str, summary: dict[str, Any]) -> str:
     """Markdown that says what `adapt` did."""
     lines = []
-    for by, rows in told["found"].items():
+    for by, rows in summary["found"].items():
         for key, label in (("found@5%", "found within 5 % of the size"), ("spurious", "spurious")):
             cells = [_format_share(rows[when][key], rows[when]["intervals"][key]) for when in ("before", "after")]
             change = _format_share(rows["after"][key] - rows["before"][key], rows["change"][key], "+.0f")
             lines.append(f"| photographs, {LABELS[by]}: {label} | {' | '.join(cells)} | {change} |")
-    before, after = told["rmse_px"]["before"], told["rmse_px"]["after"]
+    before, after = summary["rmse_px"]["before"], summary["rmse_px"]["after"]
     lines.append(f"| renders of the sample: RMSE | {before:.1f} px | {after:.1f} px | {after / before - 1:+.0%} |")
-    limits = MEASURED.format(folds=told["folds"]) if told["found"] else NOT_MEASURED
-    limits = limits if told["steps"] else f"{UNCHANGED}\n{limits}"
-    known = {"name": name, "rows": "\n".join(lines), "limits": limits, "minutes": told["seconds"] / 60}
-    known |= {"taken": told["steps"], "steps": told["asked"]["steps"]}
-    return CARD.format(**told["asked"] | told | known)
+    limits = MEASURED.format(folds=summary["folds"]) if summary["found"] else NOT_MEASURED
+    limits = limits if summary["steps"] else f"{UNCHANGED}\n{limits}"
+    fields = {"name": name, "rows": "\n".join(lines), "limits": limits, "minutes": summary["seconds"] / 60}
+    fields |= {"taken": summary["steps"], "steps": summary["asked"]["steps"]}
+    return CARD.format(**summary["asked"] | summary | fields)
 
 
 def _format_share(value: float, interval: Sequence[float] | None, form: str = ".0f") -> str:

@@ -119,8 +119,8 @@ def warp_images(
     enters from outside is mirrored background, or nothing (0) for a mask. Returns (size[1], size[0], …) each.
     """
     columns, rows = (rescale(np.arange(n), n, whole) for n, whole in zip(size, full, strict=True))
-    found = warp.find_grid_source(columns, rows)
-    source = rescale(found, full, images[0].shape[1::-1]).astype(np.float32)
+    grid = warp.find_grid_source(columns, rows)
+    source = rescale(grid, full, images[0].shape[1::-1]).astype(np.float32)
     borders = [cv2.BORDER_CONSTANT if image.ndim == 2 else cv2.BORDER_REFLECT_101 for image in images]
     return [cv2.remap(image, source, None, cv2.INTER_LINEAR, borderMode=border)
             for image, border in zip(images, borders, strict=True)]  # fmt: skip
@@ -167,8 +167,8 @@ def make_batch(
     is off; with ``config.clutter`` they are also put together
     anew (`mmgsd.learn.compositing`), with ``config.strong`` retextured (`mmgsd.learn.texturing`).
     """
-    made = [_make_one(images, int(index), config, rng) for index in indices]
-    image, mask, xy, visible, present = (np.stack(values) for values in zip(*made, strict=True))
+    samples = [_make_one(images, int(index), config, rng) for index in indices]
+    image, mask, xy, visible, present = (np.stack(values) for values in zip(*samples, strict=True))
     inside = np.all((xy > -0.5) & (xy < np.array(images.size) - 0.5), axis=-1) & present[:, None]
     image = torch.from_numpy(image).to(device).permute(0, 3, 1, 2).float() / 255
     tensors = (torch.from_numpy(a).to(device) for a in (mask, xy.astype(np.float32), inside & visible, inside))
@@ -196,9 +196,9 @@ def _make_one(images: TrainingImages, index: int, config: TrainConfig, rng: np.r
         image = retexture(image, mask, there, visible, config.object, lambda: _borrow(images, rng), rng)
     if config.clutter:
         beside = not config.strong or config.object == "rope"
-        made = composite(image, mask, lambda: _borrow(images, rng), rng, lookalikes_beside=beside)
-        image, mask, present = made.image, made.mask, present and made.present
-        visible = visible & ~_look_up(made.covered, xy, images.size) & present
+        composited = composite(image, mask, lambda: _borrow(images, rng), rng, lookalikes_beside=beside)
+        image, mask, present = composited.image, composited.mask, present and composited.present
+        visible = visible & ~_look_up(composited.covered, xy, images.size) & present
     image = jitter_colours(image, rng) if config.augment else image
     return disturb(image, rng) if config.clutter else image, mask > 127, xy, visible, present
 

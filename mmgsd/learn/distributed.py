@@ -80,7 +80,7 @@ def _on_this_machine() -> Iterator[None]:
     before = {name: os.environ.get(name) for name in INTERFACES}
     if os.environ.get("LOCAL_WORLD_SIZE") == os.environ.get("WORLD_SIZE"):
         addresses = psutil.net_if_addrs().items()
-        loopback = [name for name, known in addresses if any(one.address == "127.0.0.1" for one in known)]
+        loopback = [name for name, entries in addresses if any(one.address == "127.0.0.1" for one in entries)]
         os.environ.update({name: loopback[0] for name in INTERFACES if loopback and before[name] is None})
     try:
         yield

@@ -78,8 +78,8 @@ def make_prototypes(xy: np.ndarray, permutations: np.ndarray, dim: int, diagonal
     kernel -= kernel.mean(0) + kernel.mean(1)[:, None] - kernel.mean()
     values, vectors = np.linalg.eigh((kernel + kernel.T) / 2)
     features = np.zeros((len(kernel), dim))
-    kept = min(dim, len(kernel))
-    features[:, :kept] = (vectors * np.sqrt(values.clip(min=0)))[:, ::-1][:, :kept]
+    rank = min(dim, len(kernel))
+    features[:, :rank] = (vectors * np.sqrt(values.clip(min=0)))[:, ::-1][:, :rank]
     features *= np.sqrt(SPREAD / (2 * np.square(features).sum(1).mean() + 1e-12))
     return torch.from_numpy(features.astype(np.float32))
 

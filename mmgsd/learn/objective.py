@@ -105,7 +105,7 @@ def _compute_visibility_loss(
     images, dim = len(batch.image), outputs.descriptors.shape[1] // heads.roles
     points = torch.multinomial(batch.askable.float() + 1e-9, VISIBILITY_POINTS, True, generator=generator)  # (B, Q)
     rows = torch.arange(images, device=points.device)
-    known = batch.askable[rows[:, None], points]  # (B, Q)
+    askable = batch.askable[rows[:, None], points]  # (B, Q)
     source = sample_descriptors(outputs.descriptors.detach(), batch.xy[rows[:, None], points], size)[..., :dim]
     target = rows.roll(1)  # image whose places are looked at, of each source
     orbit = permutations[:, points].permute(1, 2, 0)  # (B, Q, G)
@@ -117,7 +117,7 @@ def _compute_visibility_loss(
     there = sample_descriptors(there, places.flatten(1, 2), size).view(*places.shape[:3], -1)
     channels = outputs.descriptors.shape[1]
     logits = heads.visibility(source[:, :, None], there[..., :channels], there[..., channels:])
-    return losses.compute_visibility_loss(logits, seen, valid & known[..., None])
+    return losses.compute_visibility_loss(logits, seen, valid & askable[..., None])
 
 
 def _draw_places(modes: Tensor, size: tuple[int, int], generator: torch.Generator) -> Tensor:

@@ -89,8 +89,8 @@ def join_batches(batches: Sequence[Batch]) -> Batch:
 def _number_marks(photograph: Photograph, group: SymmetryGroup, kind: str) -> np.ndarray:
     """The numbers of the points that a photograph's marks are, (k,)."""
     points = ENDS[kind][1] if kind in ENDS and photograph.by != "marks" else ()
-    known = bool(points) and {*points} == {*group.orbit(points[0])}
-    numbers = np.array(points) if known else group.n_points + np.arange(group.order)
+    is_orbit = bool(points) and {*points} == {*group.orbit(points[0])}
+    numbers = np.array(points) if is_orbit else group.n_points + np.arange(group.order)
     if len(photograph.xy) > len(numbers):
         raise ValueError(f"{photograph.path} must have at most {len(numbers)} marks, as many places as look alike "
                          f"under the group {group.name!r}, got {len(photograph.xy)}")  # fmt: skip
@@ -118,14 +118,14 @@ def _find_sure(matcher: Matcher, image: np.ndarray, outputs: Outputs, mask: np.n
     if not len(places):
         return np.zeros((0, group, 2))
     answer = Pair(matcher, image, image, (outputs, outputs)).match(places)
-    apart = np.linalg.norm(answer.modes - places[:, None], axis=-1) / max(image.shape[:2])  # (S, G), NaN: merged
-    sure = np.where(np.isnan(apart).any(1) | (apart.min(1) > NEAR), 0, answer.confidence().min(1))
+    distance = np.linalg.norm(answer.modes - places[:, None], axis=-1) / max(image.shape[:2])  # (S, G), NaN: merged
+    sure = np.where(np.isnan(distance).any(1) | (distance.min(1) > NEAR), 0, answer.confidence().min(1))
     order = np.argsort(-sure, kind="stable")[:SURE]
     order = order[sure[order] >= LEAST_CONFIDENCE]
-    own_first = np.argsort(apart[order], axis=1)[..., None]
-    found = np.take_along_axis(answer.modes[order], own_first, 1).astype(float)
-    found[:, 0] = places[order]
-    return found
+    own_first = np.argsort(distance[order], axis=1)[..., None]
+    modes = np.take_along_axis(answer.modes[order], own_first, 1).astype(float)
+    modes[:, 0] = places[order]
+    return modes
 
 
 def _fit(
@@ -146,11 +146,11 @@ def _fit(
     before, after = np.maximum(0, -corner), np.maximum(0, corner + inner - fitted)
     padding = before[1], after[1], before[0], after[0]
     (left, top), (width, height) = np.maximum(0, corner), inner
-    made = []
+    planes = []
     for plane, border in ((image, cv2.BORDER_REPLICATE), (mask, cv2.BORDER_CONSTANT)):
         small = cv2.resize(plane, fitted.tolist(), interpolation=cv2.INTER_AREA)
         padded = cv2.copyMakeBorder(small, *map(int, padding), border)
-        made.append(np.ascontiguousarray(padded[top : top + height, left : left + width]))
+        planes.append(np.ascontiguousarray(padded[top : top + height, left : left + width]))
     moved = rescale(xy, old, fitted) - corner
-    shown = (xy > NOWHERE).all(1) & (moved > -0.5).all(1) & (moved < inner - 0.5).all(1)
-    return *made, np.where(shown[:, None], rescale(moved, inner, np.array(matcher.size)), NOWHERE)
+    inside = (xy > NOWHERE).all(1) & (moved > -0.5).all(1) & (moved < inner - 0.5).all(1)
+    return *planes, np.where(inside[:, None], rescale(moved, inner, np.array(matcher.size)), NOWHERE)

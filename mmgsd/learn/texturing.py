@@ -93,11 +93,11 @@ def _lay_on(mask: np.ndarray, xy: np.ndarray, flat: np.ndarray, object: str) -> 
 def _interpolate(xy: np.ndarray, flat: np.ndarray, places: np.ndarray, object: str) -> np.ndarray:
     """(K, 2) in [0, 1], where ``places`` (K, 2) px lie on the texture; beyond points seen, where the nearest does."""
     _, nearest = cKDTree(xy).query(places)
-    found = flat[nearest]
+    uv = flat[nearest]
     if object != "rope" and np.linalg.matrix_rank(xy - xy.mean(0), tol=1.0) == 2:
         between = LinearNDInterpolator(xy, flat)(places)
-        found = np.where(np.isnan(between), found, between)
-    return found.clip(0, 1)
+        uv = np.where(np.isnan(between), uv, between)
+    return uv.clip(0, 1)
 
 
 def _sew_patches(borrow: Borrow, rng: np.random.Generator) -> np.ndarray:

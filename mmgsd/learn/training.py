@@ -144,8 +144,8 @@ def train_model(
             remove_run(folder)
         world.wait()
         run.resume()
-        shown = progress and world.rank == 0
-        bar = ProgressBar(range(run.step, config.steps), desc=config.name, disable=not shown, leave=False)
+        show_bar = progress and world.rank == 0
+        bar = ProgressBar(range(run.step, config.steps), desc=config.name, disable=not show_bar, leave=False)
         with saying_what_stays(run.describe_kept):
             for _ in bar:
                 bar.set_postfix(loss=f"{run.advance():.3f}", refresh=False)
@@ -171,14 +171,14 @@ class Run:
         self.data, self.held_out = (join_datasets(*split) for split in zip(*map(hold_out, parts), strict=True))
         check_enough(self.data, self.held_out)
         self.device, self.size = world.device, self.data.size
-        known = self.data.group(config.group).permutations
-        known = known[:1] if config.method in MATCHES_OF_ONE else known
-        self.permutations = torch.tensor(known, device=self.device)
+        permutations = self.data.group(config.group).permutations
+        permutations = permutations[:1] if config.method in MATCHES_OF_ONE else permutations
+        self.permutations = torch.tensor(permutations, device=self.device)
         self.images = load_training_images(self.data, config.input_px)
         torch.manual_seed(config.seed)
         network, prototypes = _make_network(config, folder.parent)
         if prototypes is None or prototypes.shape != (self.data.n_points, config.descriptor_dim):
-            prototypes = make_prototypes(self.data.xy, known, config.descriptor_dim, math.hypot(*self.size))
+            prototypes = make_prototypes(self.data.xy, permutations, config.descriptor_dim, math.hypot(*self.size))
         self.start(network, prototypes, span=config.steps / 50)
 
     def start(self, network: nn.Module, prototypes: Tensor, *, span: float) -> None:
@@ -260,8 +260,8 @@ class Run:
 
     def describe_kept(self) -> str:
         """What is on disk of a run that is stopped."""
-        kept = f"its checkpoint of step {self.saved_step} is kept in {self.folder}: call again without overwrite"
-        return f"training was stopped after step {self.step}; {kept if self.saved_step else 'nothing is kept yet'}"
+        resumable = f"its checkpoint of step {self.saved_step} is kept in {self.folder}: call again without overwrite"
+        return f"training was stopped after step {self.step}; {resumable if self.saved_step else 'nothing is kept yet'}"
 
     def resume(self) -> None:
         """Go on from the folder's checkpoint, if there is one; ValueError where it is of another configuration."""

@@ -91,7 +91,7 @@ class FeatureMatcher:
 
     def match_many(self, questions: Iterable[tuple[Any, ...]], *, n: Any = None) -> Iterator[Match]:
         """As `Matcher.match_many`; what a mask0 says is not needed."""
-        return (self.match(*asked, n=n, mask1=mask1) for *asked, _, mask1 in map(fill_question, questions))
+        return (self.match(*question, n=n, mask1=mask1) for *question, _, mask1 in map(fill_question, questions))
 
 
 class BaselineMatcher(FeatureMatcher):
@@ -192,8 +192,8 @@ def _describe_keypoints(grey: np.ndarray, xy: np.ndarray, method: str) -> np.nda
     ]
     orb = method == "orb"
     extractor = cv2.ORB_create(scaleFactor=2.0, nlevels=2, edgeThreshold=0) if orb else cv2.SIFT_create()
-    kept, descriptors = extractor.compute(grey, keypoints)
-    assert len(kept) == len(xy), f"{method} dropped {len(xy) - len(kept)} keypoints"
+    keypoints, descriptors = extractor.compute(grey, keypoints)
+    assert len(keypoints) == len(xy), f"{method} dropped {len(xy) - len(keypoints)} keypoints"
     if orb:  # compared by Hamming distance
         bits = np.unpackbits(descriptors, axis=1)
         return 2 * bits.astype(np.float32) - 1

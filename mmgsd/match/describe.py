@@ -17,12 +17,12 @@ def describe_answer(match: Match) -> list[dict[str, Any]]:
     of one number belong together.
     """
     confidence, described = match.confidence(), []
-    known = {"entropy": match.entropy, "outside": match.outlier_mass, "on_object": match.on_object,
-             "absent": match.absent}  # fmt: skip
-    known = {name: values for name, values in known.items() if values is not None}
+    per_query = {"entropy": match.entropy, "outside": match.outlier_mass, "on_object": match.on_object,
+                 "absent": match.absent}  # fmt: skip
+    per_query = {name: values for name, values in per_query.items() if values is not None}
     for query, xy in enumerate(match.xy):
         modes = [_describe_mode(match, query, k, confidence) for k in np.flatnonzero(match.weights[query] > 0)]
-        scalars = {name: round(float(values[query]), 4) for name, values in known.items()}
+        scalars = {name: round(float(values[query]), 4) for name, values in per_query.items()}
         if "on_object" in scalars or "absent" in scalars:
             scalars["said"] = match.say_presence(query)
         described.append({"xy": xy.astype(float).round(2).tolist(), "modes": modes, **scalars})

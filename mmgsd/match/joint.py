@@ -60,9 +60,9 @@ def join(
     places. Where nothing can be told, of one mode or fewer than three pixels, modes keep their order.
     """
     count = len(xy) - places
-    given = [np.arange(first, min(first + QUESTIONS, count)) for first in range(0, max(count, 1), QUESTIONS)]
+    chunks = [np.arange(first, min(first + QUESTIONS, count)) for first in range(0, max(count, 1), QUESTIONS)]
     last, orders, common = np.arange(count, len(xy)), [], None
-    for rows in (np.concatenate([part, last]) for part in given):
+    for rows in (np.concatenate([part, last]) for part in chunks):
         order = _join(*(values[rows] for values in (xy, modes, weights, spread)), mask)
         if common is None:
             heavy = np.take_along_axis(weights[rows], order, 1)[-places:].sum(0)  # of all, where there are no places
@@ -78,18 +78,18 @@ def join(
 def _join(xy: np.ndarray, modes: np.ndarray, weights: np.ndarray, spread: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """The order (S, n) that is the most likely of the outcomes that start at several pixels."""
     count, n = weights.shape
-    known = np.isfinite(modes).all(-1)
-    if n < 2 or count < 3 or not known.all(1).any():
+    valid = np.isfinite(modes).all(-1)
+    if n < 2 or count < 3 or not valid.all(1).any():
         return np.tile(np.arange(n), (count, 1))
     values, variance, _, _ = _scale(modes, spread)
     log_weights = np.log(np.clip(np.nan_to_num(weights), 1e-3, None))
     edges, length = _measure_edges(xy, mask)
     kernel = _make_kernel(edges, length, count)
     ways = shortest_path(coo_matrix((length, edges.T), shape=(count, count)), directed=False)  # by the extent
-    rivals = _find_rivals(ways, values, known)
-    found = [_assign(kernel, rivals, values, variance, log_weights, start)
-             for start in _choose_starts(values, variance, known)]  # fmt: skip
-    return max(found, key=lambda outcome: outcome[1])[0]
+    rivals = _find_rivals(ways, values, valid)
+    outcomes = [_assign(kernel, rivals, values, variance, log_weights, start)
+                for start in _choose_starts(values, variance, valid)]  # fmt: skip
+    return max(outcomes, key=lambda outcome: outcome[1])[0]
 
 
 def predict(xy: np.ndarray, mask: np.ndarray, modes: np.ndarray, spread: np.ndarray) -> np.ndarray:
@@ -104,11 +104,11 @@ def predict(xy: np.ndarray, mask: np.ndarray, modes: np.ndarray, spread: np.ndar
 
 def _scale(modes: np.ndarray, spread: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Modes from their middle, and variances, both by the object's extent; that middle and extent (px)."""
-    known = np.isfinite(modes).all(-1)
-    middle = modes[known].mean(0)
-    extent = max(float(np.sqrt(np.mean(np.sum((modes[known] - middle) ** 2, -1)))), 1e-6)
-    values = np.where(known[..., None], (modes - middle) / extent, 0.0)
-    return values, np.where(known, (np.nan_to_num(spread) / extent) ** 2 + NOISE**2, 4.0), middle, extent
+    valid = np.isfinite(modes).all(-1)
+    middle = modes[valid].mean(0)
+    extent = max(float(np.sqrt(np.mean(np.sum((modes[valid] - middle) ** 2, -1)))), 1e-6)
+    values = np.where(valid[..., None], (modes - middle) / extent, 0.0)
+    return values, np.where(valid, (np.nan_to_num(spread) / extent) ** 2 + NOISE**2, 4.0), middle, extent
 
 
 def _measure_edges(xy: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -159,19 +159,19 @@ def _connect(edges: np.ndarray, xy: np.ndarray) -> np.ndarray:
         edges = np.vstack([edges, np.sort([inside[nearest[k]], others[k]])])
 
 
-def _find_rivals(ways: np.ndarray, values: np.ndarray, known: np.ndarray) -> np.ndarray:
+def _find_rivals(ways: np.ndarray, values: np.ndarray, valid: np.ndarray) -> np.ndarray:
     """(S n, S n): how much a mode lies where those of far places do; rows sum to less than 1."""
     n, flat = values.shape[1], values.reshape(-1, 2)
     far = 1 / (1 + np.exp(np.clip((FAR - ways) / STEP, -50, 50)))
     gap = np.linalg.norm(flat[:, None] - flat, axis=-1)
-    close = np.exp(-0.5 * (gap / NEAR) ** 2) * np.kron(far, np.ones((n, n))) * np.outer(known, known)
+    close = np.exp(-0.5 * (gap / NEAR) ** 2) * np.kron(far, np.ones((n, n))) * np.outer(valid, valid)
     return close / (close.sum(1, keepdims=True) + 1.0)
 
 
-def _choose_starts(values: np.ndarray, variance: np.ndarray, known: np.ndarray) -> np.ndarray:
+def _choose_starts(values: np.ndarray, variance: np.ndarray, valid: np.ndarray) -> np.ndarray:
     """Places whose modes lie clear of each other."""
     gaps = np.linalg.norm(values[:, :, None] - values[:, None], axis=-1) + 1e3 * np.eye(values.shape[1])
-    clear = gaps.min((1, 2)) / np.sqrt(variance.max(1)) * known.all(1)
+    clear = gaps.min((1, 2)) / np.sqrt(variance.max(1)) * valid.all(1)
     return np.argsort(-clear)[: STARTS * APART : APART]
 
 
@@ -181,33 +181,33 @@ def _assign(
 ) -> tuple[np.ndarray, float]:  # fmt: skip
     """The order (S, n) found from one place, whose modes are numbered as they come, and its mean log-likelihood."""
     count, n = variance.shape
-    told = np.repeat(values.mean(1, keepdims=True), n, 1)  # (S, map, 2) where each place says that the maps take it
+    observed = np.repeat(values.mean(1, keepdims=True), n, 1)  # (S, map, 2) where each place says that the maps take it
     noise = np.full((count, n), UNKNOWN)
-    told[start], noise[start] = values[start], variance[start]
+    observed[start], noise[start] = values[start], variance[start]
     sure = np.zeros((count, n))
     share = np.full((count, n, n), 1 / n)  # (S, mode, map)
     for _ in range(ROUNDS):
-        mean, others = _predict(kernel, told, noise)
+        mean, others = _predict(kernel, observed, noise)
         mean[start], others[start] = values[start], variance[start]
         total = others[:, None] + variance[..., None]
         error = np.sum((values[:, :, None] - mean[:, None]) ** 2, -1)
         logits = log_weights[..., None] - error / (2 * total) - np.log(total)
         crowd = (rivals @ (share * sure[:, None] ** 2).reshape(-1, n)).reshape(share.shape)
         share = _balance(logits - REPULSION * crowd)
-        told = np.einsum("sag,sad->sgd", share, values)
-        scatter = np.sum((values[:, :, None] - told[:, None]) ** 2, -1) / 2
+        observed = np.einsum("sag,sad->sgd", share, values)
+        scatter = np.sum((values[:, :, None] - observed[:, None]) ** 2, -1) / 2
         sure = (np.sum(share**2, 1) - 1 / n) / (1 - 1 / n)  # 0 where all modes fit alike
         noise = np.einsum("sag,sag->sg", share, variance[..., None] + scatter) / np.maximum(sure, 0.01) ** 2
     return _round(share), float(np.mean(np.sum(share * np.clip(logits, -50, None), (1, 2))))
 
 
-def _predict(kernel: np.ndarray, told: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _predict(kernel: np.ndarray, observed: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Means (S, n, 2) and variances (S, n) of maps at each place, by what all the others say."""
-    middle = told.mean(0)
+    middle = observed.mean(0)
     inverse = np.linalg.inv(kernel + noise.T[..., None] * np.eye(len(kernel)))  # (n, S, S)
-    pull = inverse @ (told - middle).transpose(1, 0, 2)
+    pull = inverse @ (observed - middle).transpose(1, 0, 2)
     precision = np.diagonal(inverse, axis1=1, axis2=2)
-    mean = told - (pull / precision[..., None]).transpose(1, 0, 2)
+    mean = observed - (pull / precision[..., None]).transpose(1, 0, 2)
     return mean, np.maximum(1 / precision - noise.T, 1e-6).T
 
 

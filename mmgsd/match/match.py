@@ -113,9 +113,9 @@ class Match:
         radius = RADIUS_PX if radius_px is None else radius_px / self.scale
         if not radius > 0:
             raise ValueError(f"radius_px must be greater than 0 px, got {radius_px!r}")
-        shown = 1.0 if self.on_object is None else self.on_object[:, None]
-        shown = shown if self.absent is None else shown * (1 - self.absent[:, None])
-        return self._promise.compute_confidence(radius, self._measured) * shown
+        presence = 1.0 if self.on_object is None else self.on_object[:, None]
+        presence = presence if self.absent is None else presence * (1 - self.absent[:, None])
+        return self._promise.compute_confidence(radius, self._measured) * presence
 
     @numpy_defaults()
     def radius_px(self, *, level: float = 0.9) -> np.ndarray:
@@ -220,14 +220,14 @@ class Match:
         if rows.ndim > 1:
             raise IndexError(f"index must have one axis, got shape {np.shape(index)}")
         names = {field.name for field in dataclasses.fields(self)} - {*SHARED}
-        known = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
-        return dataclasses.replace(self, **{name: value[rows] for name, value in known.items()})
+        arrays = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        return dataclasses.replace(self, **{name: value[rows] for name, value in arrays.items()})
 
     def __repr__(self) -> str:
         sizes = (f"{image.shape[1]} x {image.shape[0]} px" for image in (self.image0, self.image1))
         queries = "1 query" if len(self) == 1 else f"{len(self)} queries"
-        known = "" if self.calibration else ", not calibrated"
-        return f"Match({queries}, up to {self.modes.shape[1]} modes each, images of {' and '.join(sizes)}{known})"
+        note = "" if self.calibration else ", not calibrated"
+        return f"Match({queries}, up to {self.modes.shape[1]} modes each, images of {' and '.join(sizes)}{note})"
 
     def plot(self, index: int = 0):  # noqa: ANN201 (matplotlib is imported only where a plot is asked for)
         """Figure of source pixel, heatmap and modes with their 1-std ellipses, for one query.

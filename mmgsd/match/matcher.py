@@ -352,11 +352,11 @@ def find_weights(weights: Path | str) -> Path:
 
 def fill_question(question: Iterable[Any]) -> tuple[Any, Any, Any, Any, Any]:
     """(image0, image1, xy, mask0, mask1) of a question, None for masks that it lacks; ValueError for another length."""
-    given = tuple(question)
-    if len(given) not in (3, 5):
+    values = tuple(question)
+    if len(values) not in (3, 5):
         raise ValueError("questions must be (image0, image1, xy) or (image0, image1, xy, mask0, mask1) each, "
-                         f"got {len(given)} values")  # fmt: skip
-    return (*given, None, None)[:5]
+                         f"got {len(values)} values")  # fmt: skip
+    return (*values, None, None)[:5]
 
 
 def _check_size(size: tuple[int, int]) -> None:

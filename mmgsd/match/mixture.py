@@ -102,8 +102,8 @@ def fit_modes(
     mass = _interpolate(mass, grid)
     powered = _raise(mass, readout.exponent)
     step, middle = torch.stack([xs[1] - xs[0], ys[1] - ys[0]]), torch.stack([xs.mean(), ys.mean()])  # px a cell, px
-    given = [_make_params((each.to(mass) - middle) / step) for each in ([] if start is None else [start]) + [*others]]
-    fitted = [_run_em(powered, each, _describe_cells(grid, mass.device), readout) for each in given]
+    starts = [_make_params((each.to(mass) - middle) / step) for each in ([] if start is None else [start]) + [*others]]
+    fitted = [_run_em(powered, each, _describe_cells(grid, mass.device), readout) for each in starts]
     if start is not None:
         params = fitted.pop(0)
     elif count is None:
@@ -206,12 +206,12 @@ def _measure_shares(mass: Tensor, params: Tensor, grid: tuple[int, int], readout
 
 
 def _measure_part(mass: Tensor, params: Tensor, cells: Tensor, sharpness: float) -> Tensor:
-    found = _compute_moments(mass, params, cells)
+    moments = _compute_moments(mass, params, cells)
     share = torch.softmax(_compute_log_densities(params, cells), 1).mul_(mass[:, None])  # (S, N, C)
     sharp = (share / share.amax(-1, keepdim=True).clamp(min=1e-30)) ** sharpness
     mean = (sharp @ cells[1:3].T) / sharp.sum(-1, keepdim=True).clamp(min=1e-9)
-    mean = torch.where(found[..., 2:3] > 1e-9, mean, params[..., :2])
-    return torch.cat([mean, params[..., 2:3], found[..., 3:]], -1)
+    mean = torch.where(moments[..., 2:3] > 1e-9, mean, params[..., :2])
+    return torch.cat([mean, params[..., 2:3], moments[..., 3:]], -1)
 
 
 def _get_chunk(n_max: int, mass: Tensor) -> int:

@@ -93,14 +93,14 @@ class Pair:
 
     def _look(self, match: Match, sizes: tuple[tuple[int, int], ...]) -> dict[str, np.ndarray]:
         """What is known of the object's presence: ``visible``, ``on_object`` and ``absent`` of a match."""
-        known, xy = {}, torch.from_numpy(match.xy)
+        presence, xy = {}, torch.from_numpy(match.xy)
         visible = self.matcher.compute_visible(*self.outputs, xy, torch.from_numpy(match.modes), sizes)
         if visible is not None:
-            known["visible"] = visible.cpu().numpy()
+            presence["visible"] = visible.cpu().numpy()
         on_object = look_up(self.mask0, self.outputs[0].mask, match.xy, sizes[0])
         if on_object is not None:
-            known["on_object"] = on_object
+            presence["on_object"] = on_object
         if self.mask1 is not None or self.outputs[1].presence is not None:
             absent = 0.0 if self.mask1 is not None else float(1 - self.outputs[1].presence.sigmoid())
-            known["absent"] = np.full(len(match), absent, np.float32)
-        return known
+            presence["absent"] = np.full(len(match), absent, np.float32)
+        return presence

@@ -70,10 +70,10 @@ class Track:
     @classmethod
     def collect(cls, frames: Iterable[Tracked]) -> Track:
         """All frames' answers; ValueError of none."""
-        found = list(frames)
-        if not found:
+        answers = list(frames)
+        if not answers:
             raise ValueError("frames must be images, one or more, got none")
-        return cls(*(np.stack([getattr(one, name) for one in found]) for name in cls.__annotations__))
+        return cls(*(np.stack([getattr(one, name) for one in answers]) for name in cls.__annotations__))
 
     def __len__(self) -> int:
         return len(self.xy)
@@ -168,8 +168,8 @@ class Tracker:
                     scores[k], columns[k] = score, whose[before.columns[j]]
         return scores, columns
 
-    def _remember(self, modes: np.ndarray, found: tuple[np.ndarray, np.ndarray]) -> None:
-        self._memory.append(_Seen(self._frames, self._seen, modes, *found))
+    def _remember(self, modes: np.ndarray, hypotheses: tuple[np.ndarray, np.ndarray]) -> None:
+        self._memory.append(_Seen(self._frames, self._seen, modes, *hypotheses))
 
     def _take(self, match: Match, order: np.ndarray, sure: float, absent: float) -> Tracked:
         """The answer that the maps, in the first frame's ``order`` (R, n), give of the points."""
@@ -221,17 +221,17 @@ class _Motion:
             self._at, self._variance = np.full((len(modes), 2), np.nan), np.zeros(len(modes))
             self._strikes, self._before = np.zeros(len(modes), int), grey
         factor = np.array(grey.shape[::-1]) / image.shape[1::-1]
-        moved, kept = flow_there_and_back(self._before, grey, (self._at + 0.5) * factor - 0.5)
+        moved, consistent = flow_there_and_back(self._before, grey, (self._at + 0.5) * factor - 0.5)
         moved = (moved + 0.5) / factor - 0.5
         gap = np.nan_to_num(np.linalg.norm(modes - moved[:, None], axis=-1), nan=np.inf)  # (K, n)
         near = gap.argmin(1)
         variance, error = self._variance + (DRIFT_PX * self._scale) ** 2, spread[rows, near] ** 2
-        fits = kept & (gap[rows, near] < GATE * np.sqrt(variance + error))
+        fits = consistent & (gap[rows, near] < GATE * np.sqrt(variance + error))
         self._strikes = np.where(fits & (near > 0), self._strikes + 1, 0)
         gain = np.where(fits, variance / (variance + ALIKE * error), 0.0)
         at = moved + gain[:, None] * np.nan_to_num(modes[rows, near] - moved)
         variance = np.where(fits, (1 - gain) * variance, DOUBT * variance)
-        lost = (~kept | (self._strikes >= PATIENCE)) & np.isfinite(modes[:, 0]).all(1)
+        lost = (~consistent | (self._strikes >= PATIENCE)) & np.isfinite(modes[:, 0]).all(1)
         self._at = np.where(lost[:, None], modes[:, 0], at)
         self._variance = np.where(lost, spread[:, 0] ** 2, variance)
         self._before = grey
@@ -243,14 +243,14 @@ def flow_there_and_back(before: np.ndarray, after: np.ndarray, points: np.ndarra
 
     OpenCV's pyramidal Lucas and Kanade; NaN stays NaN.
     """
-    known = np.isfinite(points).all(1)
-    if not known.any():
-        return points.copy(), known
-    start = np.where(known[:, None], points, 0).astype(np.float32)[:, None]
+    finite = np.isfinite(points).all(1)
+    if not finite.any():
+        return points.copy(), finite
+    start = np.where(finite[:, None], points, 0).astype(np.float32)[:, None]
     moved, there, _ = cv2.calcOpticalFlowPyrLK(before, after, start, None)
     back, again, _ = cv2.calcOpticalFlowPyrLK(after, before, moved, None)
     near = np.linalg.norm((back - start)[:, 0], axis=1) < RETURN_PX
-    return np.where(known[:, None], moved[:, 0], np.nan), known & near & (there & again > 0)[:, 0]
+    return np.where(finite[:, None], moved[:, 0], np.nan), finite & near & (there & again > 0)[:, 0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,12 +277,12 @@ def compare_maps(before: np.ndarray, after: np.ndarray, age: int) -> np.ndarray:
     """
     extent = max(float(np.sqrt(np.nanmean(np.sum((after - np.nanmean(after, (0, 1))) ** 2, -1)))), 1e-6)
     squared = np.sum((after[:, None] - before[:, :, None]) ** 2, -1) / extent**2  # (R, n, n)
-    known, found = np.isfinite(squared), []
+    finite, likelihoods = np.isfinite(squared), []
     for pace in PACES:
         scale = min(pace * age, FARTHEST)
         density = -np.log(2 * np.pi * scale**2) - TAIL * np.log1p(squared / (2 * TAIL - 2) / scale**2)
-        found.append(np.where(known, density, 0.0).sum(0) / np.maximum(known.sum(0), 1))
-    return max(found, key=lambda likelihood: likelihood[linear_sum_assignment(-likelihood)].sum())
+        likelihoods.append(np.where(finite, density, 0.0).sum(0) / np.maximum(finite.sum(0), 1))
+    return max(likelihoods, key=lambda likelihood: likelihood[linear_sum_assignment(-likelihood)].sum())
 
 
 def assign_others(likelihood: np.ndarray, j: int, k: int) -> tuple[np.ndarray, float]:

@@ -112,12 +112,12 @@ def _calibrate(
 ) -> Path:  # fmt: skip
     """Add to a file of weights what was ``chosen``, what its modes hold on ``data``, and the matcher's places."""
     pairs, points = read_count("pairs", pairs, least=LEAST_PAIRS), read_count("points", points, least=1)
-    found = calibrate_modes(matcher, data, pairs=pairs, points=points, progress=read_flag("progress", progress))
-    if found is None:
+    calibration = calibrate_modes(matcher, data, pairs=pairs, points=points, progress=read_flag("progress", progress))
+    if calibration is None:
         raise ValueError(f"{accepted} images for at least {LEAST_PAIRS} pairs, got {len(data)} images")
     tensors, note = read_tensors(weights)
     tensors |= {PLACES: matcher.places.cpu()}
-    return write_tensors(weights, tensors, {**note, **chosen, "calibration": found.to_json()})
+    return write_tensors(weights, tensors, {**note, **chosen, "calibration": calibration.to_json()})
 
 
 def choose_temperature(matcher: Matcher, data: Dataset, *, pairs: int = 60, points: int = 40) -> float:
@@ -168,10 +168,10 @@ def describe_places(matcher: Matcher, data: Dataset) -> Tensor:
             total[points] += matcher.sample_sources(outputs, xy, data.size, shrink=False)[0].double().cpu()
             seen[points] += 1
     orbits = torch.from_numpy(data.group(matcher.config.group).permutations.T.copy())  # (P, G)
-    mean, known = total[orbits].sum(1) / seen[orbits].sum(1).clamp(min=1), seen[orbits].sum((1, 2)) > 0
+    mean, is_seen = total[orbits].sum(1) / seen[orbits].sum(1).clamp(min=1), seen[orbits].sum((1, 2)) > 0
     numbers = torch.arange(data.n_points)
-    nearest = (numbers[:, None] - numbers[known]).abs().argmin(1)
-    return mean[known][nearest].float()
+    nearest = (numbers[:, None] - numbers[is_seen]).abs().argmin(1)
+    return mean[is_seen][nearest].float()
 
 
 def choose_readout(
@@ -182,11 +182,11 @@ def choose_readout(
     Of `POWERS` and `SHARPNESSES` that with the largest found share less the spurious one, as `count_seen` counts them,
     among those whose RMSE is at most `ALLOWED` times what it is without. Leaves it set on the matcher and returns it.
     """
-    asked = list(_ask_seen(matcher, data, EvaluateConfig(pairs=pairs, points=points)))
+    questions = list(_ask_seen(matcher, data, EvaluateConfig(pairs=pairs, points=points)))
     plain = ModeReadout(matcher.readout.shape_prior)
     readouts = [dataclasses.replace(plain, exponent=a, mean_exponent=b) for a in POWERS for b in SHARPNESSES]
     bar = ProgressBar(readouts, desc="choose a reading", disable=not progress, leave=False)
-    quality = {readout: measure_readout(asked, readout, data.size) for readout in bar}
+    quality = {readout: measure_readout(questions, readout, data.size) for readout in bar}
     allowed = {readout: gain for readout, (rmse, gain) in quality.items() if rmse <= ALLOWED * quality[plain][0]}
     matcher.readout = max(allowed, key=allowed.get)
     return matcher.readout
@@ -200,24 +200,24 @@ def _ask_seen(
     outputs, group = describe(matcher, data, np.unique(chosen)), data.group(matcher.config.group).permutations
     points = points[[len(np.unique(group[:, point])) == len(group) for point in points]]  # none of a symmetry's centre
     for first, second in chosen:
-        shown = points[data.visible[first, points]]
-        if len(shown):
-            xy, orbits = torch.from_numpy(data.xy[first, shown]), group[:, shown].T  # (S, 2), (S, n)
+        seen_points = points[data.visible[first, points]]
+        if len(seen_points):
+            xy, orbits = torch.from_numpy(data.xy[first, seen_points]), group[:, seen_points].T  # (S, 2), (S, n)
             heatmaps = matcher.compute_heatmaps(outputs[first], outputs[second], xy, data.size)
             yield heatmaps, data.xy[second][orbits].astype(float), data.visible[second][orbits]
 
 
 def measure_readout(
-    asked: list[tuple[Tensor, np.ndarray, np.ndarray]], readout: ModeReadout, size: tuple[int, int]
+    questions: list[tuple[Tensor, np.ndarray, np.ndarray]], readout: ModeReadout, size: tuple[int, int]
 ) -> tuple[float, float]:
     """Mean RMSE in px, and mean found share less the spurious one, on questions about images of ``size``."""
     rows = []
-    for heatmaps, true, seen in asked:
+    for heatmaps, true, seen in questions:
         fit = fit_modes(heatmaps, true.shape[1], *compute_cell_centres(size, heatmaps.shape[-2:]), readout=readout)
         modes, covariances = (t.double().cpu().numpy() for t in (fit.modes, fit.covariances))
         rows.append((compute_query_errors(modes, covariances, true)["rmse_px"], *count_seen(modes, true, seen)))
-    rmse_px, found, spurious = (float(np.concatenate(values).mean()) for values in zip(*rows, strict=True))
-    return rmse_px, found - spurious
+    rmse_px, found_share, spurious = (float(np.concatenate(values).mean()) for values in zip(*rows, strict=True))
+    return rmse_px, found_share - spurious
 
 
 def count_seen(modes: np.ndarray, true: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -226,14 +226,14 @@ def count_seen(modes: np.ndarray, true: np.ndarray, seen: np.ndarray) -> tuple[n
     ``modes`` and ``true`` (S, n, 2) px, ``seen`` (S, n) bool. Found: of the seen matches those with a mode within
     `RADIUS_PX`. Spurious: of the k most probable modes, k matches being seen, those twice as far from all of them.
     """
-    asked = seen.any(1)
-    modes, true, seen = modes[asked], true[asked], seen[asked]
+    any_seen = seen.any(1)
+    modes, true, seen = modes[any_seen], true[any_seen], seen[any_seen]
     distance = np.linalg.norm(modes[:, :, None] - true[:, None], axis=-1)  # (Q, modes, matches)
     count = seen.sum(1)
-    found = ((distance.min(1) < RADIUS_PX) & seen).sum(1) / count
+    found_share = ((distance.min(1) < RADIUS_PX) & seen).sum(1) / count
     far = np.where(seen[:, None], distance, np.inf).min(2) > 2 * RADIUS_PX  # (Q, modes)
     first = np.arange(modes.shape[1]) < count[:, None]
-    return found, (far & first).sum(1) / count
+    return found_share, (far & first).sum(1) / count
 
 
 @own_numerics()
@@ -245,8 +245,8 @@ def calibrate_modes(
     Its errors are those of each half of the pairs under a calibration that is fitted to the other half. Leaves it set
     on the matcher and returns it.
     """
-    shown = int(data.present.sum())
-    config = EvaluateConfig(pairs=min(pairs, shown * (shown - 1)), points=points)
+    count = int(data.present.sum())
+    config = EvaluateConfig(pairs=min(pairs, count * (count - 1)), points=points)
     if config.pairs < LEAST_PAIRS:
         return None
     queries = ask(model_answer(matcher, data, config), data, config, matcher.config.group, progress, "held out")
@@ -298,11 +298,11 @@ def fit_powers(modes: Modes, distance: np.ndarray) -> tuple[float, ...]:
     """
     radii = np.log(uncertainty.RADII_PX)  # (R,)
     within = np.log(np.maximum(distance, 1e-6))[:, None] <= radii
-    known = np.stack([*(np.log(np.maximum(each, 1e-6)) for each in modes), np.ones(len(distance))], 1)  # (M, 4)
+    predictors = np.stack([*(np.log(np.maximum(each, 1e-6)) for each in modes), np.ones(len(distance))], 1)  # (M, 4)
 
     def measure(slopes: np.ndarray) -> float:
         """Negative log-likelihood of the logistic model, with a little weight decay."""
-        logits = slopes[0] * radii + (known @ slopes[1:])[:, None]
+        logits = slopes[0] * radii + (predictors @ slopes[1:])[:, None]
         return float(np.mean(np.logaddexp(0, logits) - within * logits)) + 1e-6 * float(slopes @ slopes)
 
     slopes = minimize(measure, [1.0, -1.0, 0.0, 0.0, 0.0]).x

@@ -82,9 +82,9 @@ def evaluate_baseline(
     """
     if method not in BASELINES + OPTIONAL + CHANCE:
         raise ValueError(f"method must be one of {BASELINES + CHANCE}, got {method!r}")
-    asked = method if readout == AS_IT_IS else f"{method} by {readout}"
+    label = method if readout == AS_IT_IS else f"{method} by {readout}"
     make_answer = partial(_chance_answer, method) if method in CHANCE else partial(_classical_answer, method, readout)
-    return _answer_all(make_answer, asked, dataset, config, out, group=group, overwrite=overwrite, progress=progress)
+    return _answer_all(make_answer, label, dataset, config, out, group=group, overwrite=overwrite, progress=progress)
 
 
 def load_queries(path: Path) -> pd.DataFrame:
@@ -167,13 +167,13 @@ def _classical_answer(method: str, readout: ModeReadout, data: Dataset) -> Answe
 
 def _once(extract: Extractor) -> Extractor:
     """The same for arrays that stay as they are, each asked about once."""
-    known: dict[int, Any] = {}
+    cache: dict[int, Any] = {}
 
     def extract_new(image: np.ndarray) -> Any:
         """What ``extract`` said of this array."""
-        if id(image) not in known:
-            known[id(image)] = extract(image)
-        return known[id(image)]
+        if id(image) not in cache:
+            cache[id(image)] = extract(image)
+        return cache[id(image)]
 
     return extract_new
 

@@ -77,9 +77,9 @@ def measure_mask_iou(outputs: dict[int, Outputs], data: Dataset) -> float:
     """Mean intersection over union of the masks, over the images that show the object; NaN of none."""
     shares = []
     for index in np.flatnonzero(data.present):
-        found = cv2.resize(outputs[index].mask.cpu().numpy(), data.size, interpolation=cv2.INTER_LINEAR) > 0
+        predicted = cv2.resize(outputs[index].mask.cpu().numpy(), data.size, interpolation=cv2.INTER_LINEAR) > 0
         true = data.load_mask(index)
-        shares.append((found & true).sum() / max(1, (found | true).sum()))
+        shares.append((predicted & true).sum() / max(1, (predicted | true).sum()))
     return float(np.mean(shares)) if shares else np.nan
 
 

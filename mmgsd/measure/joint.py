@@ -47,7 +47,7 @@ def measure_joint(name: str, root: Path, *, pairs: int = PAIRS, progress: bool =
     seconds: dict[bool, list[float]] = {True: [], False: []}
     for preset in SETS:
         data = load_dataset(Paths(root, preset).dataset(matcher.object), "test")
-        found: dict[str, list[dict[str, float]]] = {"all": []}
+        scores_by_state: dict[str, list[dict[str, float]]] = {"all": []}
         drawn, rng = draw_pairs(data, EvaluateConfig(pairs=pairs)), np.random.default_rng(0)
         for first, second in ProgressBar(drawn, desc=f"{name}, {preset}", unit="pair", disable=not progress):
             seen = np.flatnonzero(data.visible[first])
@@ -60,10 +60,10 @@ def measure_joint(name: str, root: Path, *, pairs: int = PAIRS, progress: bool =
                 matches[joint] = matcher.match(*images, data.xy[first][points], joint=joint)
                 seconds[joint].append(time.perf_counter() - begun)
             sorted_true = sort_true_matches(data, (first, second), points, np.random.default_rng([first, second]))
-            asked = judge_questions(data, second, points, matches[False], matches[True], sorted_true)
-            found["all"] += asked
-            found.setdefault(str(data.labels.state[second]), []).extend(asked)
-        row[preset] = {kind: summarise_questions(asked) for kind, asked in sorted(found.items())}
+            scores = score_questions(data, second, points, matches[False], matches[True], sorted_true)
+            scores_by_state["all"] += scores
+            scores_by_state.setdefault(str(data.labels.state[second]), []).extend(scores)
+        row[preset] = {kind: summarise_questions(scores) for kind, scores in sorted(scores_by_state.items())}
     took = {joint: round(1000 * statistics.median(values)) for joint, values in seconds.items()}
     row["milliseconds"] = {"joint": took[True], "alone": took[False]}
     return row | {"hardware": name_hardware(matcher.device)}
@@ -79,11 +79,11 @@ def sort_true_matches(
     first, second = pair
     others = np.setdiff1d(np.flatnonzero(data.visible[first]), points)
     places = rng.choice(others, min(PLACES, len(others)), replace=False)
-    asked = np.concatenate([points, places])
-    true = data.xy[second][_list_members(data)[:, asked].T].astype(float)  # (S + P, n, 2)
+    numbers = np.concatenate([points, places])
+    true = data.xy[second][_list_members(data)[:, numbers].T].astype(float)  # (S + P, n, 2)
     true = np.take_along_axis(true, rng.random(true.shape[:2]).argsort(1)[..., None], 1)
     even = np.full(true.shape[:2], 1 / true.shape[1])
-    xy, spread = data.xy[first, asked].astype(float), np.ones_like(even)
+    xy, spread = data.xy[first, numbers].astype(float), np.ones_like(even)
     order = join(xy, data.load_mask(first), true, even, spread, places=len(places))
     return np.take_along_axis(true, order[..., None], 1)[: len(points)]
 
@@ -93,7 +93,7 @@ def _list_members(data: Dataset) -> np.ndarray:
     return np.array(data.group(DEFAULT_GROUP.get(data.object, "")).permutations)
 
 
-def judge_questions(
+def score_questions(
     data: Dataset, second: int, points: np.ndarray, alone: Match, joint: Match, sorted_true: np.ndarray
 ) -> list[dict[str, float]]:
     """Of each question of `POINTS` of material ``points`` (S,), whether the ways of `CHOSEN` are right; its swaps.
@@ -125,8 +125,8 @@ def _measure_swaps(near: np.ndarray) -> float:
     return float(np.mean([not (near[:, i] & near[:, j]).any() for i, j in pairs])) if pairs else float("nan")
 
 
-def summarise_questions(asked: list[dict[str, float]]) -> dict[str, float]:
+def summarise_questions(scores: list[dict[str, float]]) -> dict[str, float]:
     """{measure: mean over questions, "questions": how many}; None where no question has the measure."""
-    means = pd.DataFrame(asked, columns=[*CHOSEN, *SWAPS], dtype=float).mean()
-    known = {name: None if np.isnan(mean) else round(float(mean), 4) for name, mean in means.items()}
-    return {"questions": len(asked), **known}
+    means = pd.DataFrame(scores, columns=[*CHOSEN, *SWAPS], dtype=float).mean()
+    rounded = {name: None if np.isnan(mean) else round(float(mean), 4) for name, mean in means.items()}
+    return {"questions": len(scores), **rounded}

@@ -137,8 +137,8 @@ def summarise_errors(queries: pd.DataFrame) -> ErrorSummary:
     seen = queries[queries.visible]
     bins = (seen.rmse_px.to_numpy(float) // BIN_PX).astype(int)
     by_point = seen.groupby("point").rmse_px
-    asked = by_point.size().reindex(range(N_POINTS), fill_value=0).to_numpy()
-    return ErrorSummary(asked, compute_point_errors(queries), np.bincount(bins))
+    query_counts = by_point.size().reindex(range(N_POINTS), fill_value=0).to_numpy()
+    return ErrorSummary(query_counts, compute_point_errors(queries), np.bincount(bins))
 
 
 def compute_point_errors(queries: pd.DataFrame) -> np.ndarray:

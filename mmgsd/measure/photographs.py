@@ -181,9 +181,9 @@ def measure_answers(
         seen(photograph, answer)
         rows.append(score_answer(answer, photograph))
     about = {"photographs": len(photographs), "marks": digest_marks(photographs)}
-    found = about | summarise_photographs(pd.concat(rows, ignore_index=True))
+    summary = about | summarise_photographs(pd.concat(rows, ignore_index=True))
     named = ask_by_name(matcher, photographs)
-    return found | {"by_name": summarise_photographs(pd.concat(named, ignore_index=True))} if named else found
+    return summary | {"by_name": summarise_photographs(pd.concat(named, ignore_index=True))} if named else summary
 
 
 def ask_by_name(matcher: Any, photographs: list[Photograph]) -> list[pd.DataFrame]:
@@ -196,8 +196,8 @@ def ask_by_name(matcher: Any, photographs: list[Photograph]) -> list[pd.DataFram
 
 def digest_marks(photographs: list[Photograph]) -> str:
     """What tells marks from others: what was counted by other ones cannot be compared."""
-    told = [[p.path.name, p.xy.tolist(), p.size_px, p.share, p.askable] for p in photographs]
-    return hashlib.sha256(json.dumps(told).encode()).hexdigest()[:16]
+    marks = [[p.path.name, p.xy.tolist(), p.size_px, p.share, p.askable] for p in photographs]
+    return hashlib.sha256(json.dumps(marks).encode()).hexdigest()[:16]
 
 
 def check_name(name: str) -> None:
@@ -246,9 +246,9 @@ def score_answer(answer: Match, target: Photograph) -> pd.DataFrame:
         present = modes[~np.isnan(modes).any(1)]
         distance = np.linalg.norm(present[:, None] - target.xy[None], axis=-1) / size_px  # (n, k)
         near, nearest = distance.min(0), np.linalg.norm(target.xy - best, axis=1).min() / size_px
-        found = [float((near < share).mean()) for share in (0.05, 0.1)]
+        found_shares = [float((near < share).mean()) for share in (0.05, 0.1)]
         spurious = float((distance[:k].min(1) > 0.1).mean())
-        rows.append([target.source, str(target.path), *found, spurious, 100 * float(nearest)])
+        rows.append([target.source, str(target.path), *found_shares, spurious, 100 * float(nearest)])
     return pd.DataFrame(rows, columns=["from", "file", *MEASURES])
 
 
@@ -285,8 +285,8 @@ def make_photographs_table(summary: dict[str, Any]) -> str:
     rows = {name: {key: part[key] for key in ("queries", *MEASURES, "unanswered")} for name, part in parts.items()}
     lines = [pd.DataFrame.from_dict(rows, orient="index").to_string(float_format="{:.3f}".format)]
     for name, part in whole.items():
-        known = {key: part["intervals"][key] for key in ("found@5%", "spurious") if part["intervals"].get(key)}
-        intervals = [f"{key} {low:.2f} to {high:.2f}" for key, (low, high) in known.items()]
+        bounds = {key: part["intervals"][key] for key in ("found@5%", "spurious") if part["intervals"].get(key)}
+        intervals = [f"{key} {low:.2f} to {high:.2f}" for key, (low, high) in bounds.items()]
         lines += [f"95 % intervals, {name}: {', '.join(intervals)}"] if intervals else []
     return "\n".join(lines)
 

@@ -98,11 +98,11 @@ def measure_by_name(
     Of the material points of `NAMES`, and ``points`` others. ``pairs`` are of images that show the object.
     """
     group, flat, errors = data.group(matcher.config.group), matcher.lay_flat(), {"by_picture": [], "by_name": []}
-    asked = np.unique([*NAMES[data.object].values(), *choose_points(points, data.n_points)])
+    numbers = np.unique([*NAMES[data.object].values(), *choose_points(points, data.n_points)])
     chosen = draw_pairs(data, EvaluateConfig(pairs=pairs))
     outputs = describe(matcher, data, np.unique(chosen))
     for first, second in chosen:
-        seen = asked[data.visible[first, asked]]
+        seen = numbers[data.visible[first, numbers]]
         count = group.count_modes(seen)
         for n in np.unique(count):
             some = seen[count == n]
@@ -147,9 +147,9 @@ def measure_read(
     return row
 
 
-def _describe_weights(file: Path, matcher: Matcher, **known: Any) -> dict[str, Any]:
+def _describe_weights(file: Path, matcher: Matcher, **columns: Any) -> dict[str, Any]:
     """What a row says of its weights, and how they are read."""
-    weights = {"object": matcher.object, "sha256": hashlib.sha256(file.read_bytes()).hexdigest(), **known}
+    weights = {"object": matcher.object, "sha256": hashlib.sha256(file.read_bytes()).hexdigest(), **columns}
     readout = {"power": matcher.readout.exponent, "sharpness": matcher.readout.mean_exponent}
     return weights | readout | {"shrinkage": matcher.shrinkage}
 
@@ -249,9 +249,9 @@ def measure_cloth_renders(matcher: Matcher, folder: Path | str) -> dict[str, Any
     for (image0, xy0), (image1, xy1) in permutations(renders, 2):
         prepared = matcher.prepare(image0, image1)
         for n in np.unique(count):
-            asked = points[count == n]
-            match = prepared.match(xy0[asked], n=int(n))
-            true = xy1[np.stack([group.distinct_modes(int(point)) for point in asked])]  # (S, n, 2)
+            subset = points[count == n]
+            match = prepared.match(xy0[subset], n=int(n))
+            true = xy1[np.stack([group.distinct_modes(int(point)) for point in subset])]  # (S, n, 2)
             frames.append(pd.DataFrame(compute_query_errors(match.modes, match.covariances, true)))
     return aggregate(pd.concat(frames, ignore_index=True)) | {"pictures": len(renders)}
 

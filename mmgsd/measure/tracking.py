@@ -37,10 +37,10 @@ def measure_track(xy: np.ndarray, visible: np.ndarray, truth: Truth) -> dict[str
     """
     scale = RESIZED_PX / np.array(truth.size)
     own = _measure_distance(xy, truth.xy, scale)[1:]  # (T - 1, S)
-    apart = _measure_distance(truth.xy[:, None], truth.likes, scale)[1:] > APART_PX  # (T - 1, G, S)
+    separated = _measure_distance(truth.xy[:, None], truth.likes, scale)[1:] > APART_PX  # (T - 1, G, S)
     like = _measure_distance(xy[:, None], truth.likes, scale)[1:]
-    swapped, could = (apart & (like < own[:, None])).any(1), apart.any(1)
-    taken = (apart & (like <= APART_PX) & (own > APART_PX)[:, None]).any(1)
+    swapped, could = (separated & (like < own[:, None])).any(1), separated.any(1)
+    taken = (separated & (like <= APART_PX) & (own > APART_PX)[:, None]).any(1)
     seen, predicted = truth.visible[1:], np.asarray(visible, bool)[1:]
     near = own[..., None] <= THRESHOLDS_PX  # (T - 1, S, thresholds)
     right = (near & (seen & predicted)[..., None]).sum((0, 1))

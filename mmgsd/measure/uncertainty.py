@@ -32,8 +32,8 @@ def compute_risk_coverage(error: np.ndarray, score: np.ndarray) -> tuple[np.ndar
     order = np.lexsort((error, score))
     _, tied = np.unique(score[order], return_inverse=True)
     shared = np.bincount(tied, error[order]) / np.bincount(tied)  # (scores,)
-    kept = np.arange(1, len(error) + 1)
-    return kept / max(len(error), 1), np.cumsum(shared[tied]) / kept
+    counts = np.arange(1, len(error) + 1)
+    return counts / max(len(error), 1), np.cumsum(shared[tied]) / counts
 
 
 def compute_aurc(error: np.ndarray, score: np.ndarray) -> float:

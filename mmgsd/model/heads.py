@@ -94,8 +94,8 @@ def weigh_cells(outputs: Outputs, shape: tuple[int, int], mask: Tensor | None = 
     """
     if mask is None and outputs.mask is None:
         return None
-    known = outputs.mask.sigmoid() if mask is None else mask.to(outputs.descriptors.device).float()
-    cells = F.adaptive_max_pool2d(known[None, None], tuple(shape))
+    probability = outputs.mask.sigmoid() if mask is None else mask.to(outputs.descriptors.device).float()
+    cells = F.adaptive_max_pool2d(probability[None, None], tuple(shape))
     cells = F.max_pool2d(cells, 3, 1, 1)[0, 0]
     return cells if mask is not None else cells.clamp(min=ELSEWHERE_WEIGHT)
 
@@ -108,13 +108,13 @@ def look_up(mask: np.ndarray | None, logits: Tensor | None, xy: np.ndarray, size
     """
     if mask is None and logits is None:
         return None
-    known = (logits.sigmoid() if mask is None else torch.from_numpy(mask).float())[None, None]
-    coarse = [math.ceil(side * min(1, LOOKED_UP / max(known.shape))) for side in known.shape[2:]]
+    probability = (logits.sigmoid() if mask is None else torch.from_numpy(mask).float())[None, None]
+    coarse = [math.ceil(side * min(1, LOOKED_UP / max(probability.shape))) for side in probability.shape[2:]]
     reach = max(1, round(BESIDE * max(coarse)))
-    known = F.max_pool2d(F.adaptive_max_pool2d(known, coarse), 2 * reach + 1, 1, reach)
-    grid = (torch.from_numpy(xy).to(known.device).float() + 0.5) / known.new_tensor(size) * 2 - 1
-    found = F.grid_sample(known, grid[None, None], padding_mode="border", align_corners=False)
-    return found[0, 0, 0].cpu().numpy()
+    probability = F.max_pool2d(F.adaptive_max_pool2d(probability, coarse), 2 * reach + 1, 1, reach)
+    grid = (torch.from_numpy(xy).to(probability.device).float() + 0.5) / probability.new_tensor(size) * 2 - 1
+    sampled = F.grid_sample(probability, grid[None, None], padding_mode="border", align_corners=False)
+    return sampled[0, 0, 0].cpu().numpy()
 
 
 def conv_block(inputs: int, outputs: int, *, stride: int = 1) -> nn.Sequential:

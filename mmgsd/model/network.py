@@ -124,10 +124,10 @@ class PyramidNetwork(nn.Module):
 
     def _find_detail(self, x: Tensor) -> list[Tensor]:
         """What the light branch finds after each of its convolutions, the finest first."""
-        found = [x]
+        features = [x]
         for block in self.detail:
-            found.append(block(found[-1]))
-        return found[1:]
+            features.append(block(features[-1]))
+        return features[1:]
 
     def _autocast(self, image: Tensor, wanted: bool = True) -> torch.autocast:
         return torch.autocast(image.device.type, torch.bfloat16, enabled=wanted and self.reduced_precision)

@@ -70,12 +70,12 @@ def read_weights(path: Path | str) -> tuple[torch.nn.Module, TrainConfig, dict[s
     if metadata.get("format") != FORMAT:
         raise ValueError(f"{path} holds no mmgsd weights: its metadata says format {metadata.get('format')!r}, "
                          f"not {FORMAT!r}")  # fmt: skip
-    config, known = _read_config(path, metadata)
+    config, names_object = _read_config(path, metadata)
     there = [key for key in METADATA if key != "config" and key in (*NEEDED, *metadata)]
     settings = {key: _read(path, metadata, key) for key in there}
     if PLACES in state:
         settings["places"] = _check_places(path, state.pop(PLACES), config)
-    return _make_network(path, config, state), config, settings, config.object if known else ""
+    return _make_network(path, config, state), config, settings, config.object if names_object else ""
 
 
 def _check_file(path: Path) -> None:

@@ -35,7 +35,7 @@ CLAIMS = r"@{}>{\hsize=0.85\hsize}L>{\hsize=1.15\hsize}L>{\raggedright\arrayback
 
 def list_tables() -> dict[str, Shown]:
     """{what is input: table} of all studies that the report shows."""
-    return {shown.report: shown for study in list_studies() for shown in study.tables.values() if shown.report}
+    return {table.report: table for study in list_studies() for table in study.tables.values() if table.report}
 
 
 def write_report(preset: str, root: Path) -> list[Path]:
@@ -51,11 +51,11 @@ def write_report(preset: str, root: Path) -> list[Path]:
         numbers = {**results, "config": described, "verdict": {claim.key: claim.verdict for claim in claims}}
         table = to_latex(describe_claims(results), CLAIMS)
         texts = {"results": make_definitions(preset, numbers), "claims_table": table}
-    for name, shown in list_tables().items():
-        file = Path(shown.file).name
+    for name, table in list_tables().items():
+        file = Path(table.file).name
         with told_where(paths.results / file):
             content = results.get(Path(file).stem)
-            texts[name] = NOT_RUN if content is None else to_latex(shown.make(content))
+            texts[name] = NOT_RUN if content is None else to_latex(table.make(content))
     return [write_text(root / "paper" / "generated" / f"{name}.tex", f"{text}\n") for name, text in texts.items()]
 
 

@@ -43,10 +43,10 @@ def reproduce(preset: str, *, out: TextIO = sys.stdout) -> str:
     folder = find_run(paths)
     folder.mkdir(parents=True, exist_ok=True)
     command = [sys.executable, "-m", "papermill", "--kernel", "python3", "--no-progress-bar", source, executed]
-    told, log = {**os.environ, TOLD: str(folder / "bar.txt")}, folder / "papermill.log"
+    environment, log = {**os.environ, TOLD: str(folder / "bar.txt")}, folder / "papermill.log"
     (folder / "bar.txt").unlink(missing_ok=True)  # of a killed run
     begun, screen = time.time(), Screen(out)
-    with running([*map(str, command), "-p", "preset", preset], log, told) as process:
+    with running([*map(str, command), "-p", "preset", preset], log, environment) as process:
         while process.poll() is None:
             screen.show_state(paths, begun)
             with contextlib.suppress(subprocess.TimeoutExpired):
@@ -99,8 +99,8 @@ class Screen:
 
     def __init__(self, out: TextIO) -> None:
         self.out, self.over = out, out.isatty()
-        self.told: list[str] = []  # finished stages
-        self.now, self.said = "", 0.0  # stage and time (s) of the last line that was not drawn over
+        self.finished: list[str] = []  # finished stages
+        self.now, self.printed = "", 0.0  # stage and time (s) of the last line that was not drawn over
 
     def show_state(self, paths: Paths, begun: float) -> None:
         """Tell how far a run is that began at a time (s since 1970)."""
@@ -109,8 +109,8 @@ class Screen:
             self.draw(f"starting: {_say((time.time() - begun) / 60)}", "starting")
             return
         for name in state["minutes"]:
-            if name not in self.told:
-                self.told.append(name)
+            if name not in self.finished:
+                self.finished.append(name)
                 self.write(f"{_count(state, name)}: {state['minutes'][name]:.1f} min")
         if state["now"]:
             bar = find_run(paths) / "bar.txt"
@@ -128,8 +128,8 @@ class Screen:
             columns = shutil.get_terminal_size().columns
             self.out.write(f"\r\x1b[K{line[: columns - 1]}")
             self.out.flush()
-        elif line and (now != self.now or time.monotonic() - self.said >= SAY):
-            self.now, self.said = now, time.monotonic()
+        elif line and (now != self.now or time.monotonic() - self.printed >= SAY):
+            self.now, self.printed = now, time.monotonic()
             print(line, file=self.out, flush=True)
 
 
@@ -138,8 +138,8 @@ def describe_state(state: Mapping[str, Any], stored: Mapping[str, float], doing:
     elapsed = (now - state["since"]) / 60
     left = estimate_left(state, stored, elapsed)
     rest = "time left unknown: no minutes stored" if left is None else f"about {_say(left)} left"
-    said = f"{_count(state, state['now'])}: {_say(elapsed)}, in all {_say((now - begun) / 60)}, {rest}"
-    return said + (f" | {doing}" if doing else "")
+    line = f"{_count(state, state['now'])}: {_say(elapsed)}, in all {_say((now - begun) / 60)}, {rest}"
+    return line + (f" | {doing}" if doing else "")
 
 
 def describe_failure(paths: Paths, executed: Path, log: Path, begun: float) -> str:

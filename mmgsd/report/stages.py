@@ -53,15 +53,16 @@ class Run:
             yield
             self.minutes[name] = (time.time() - since) / 60
             self.begun.remove(name)
-            if not resumed and (not skips or _has_made(self.paths, since)):
+            if not resumed and (not skips or _has_new_files(self.paths, since)):
                 self.whole[name] = round(self.minutes[name], 2)
             self._write("")
 
     def finish(self) -> Path:
         """Store the minutes of the stages that were made from nothing, beside those that are stored; the file."""
-        kept = {**self.stored, **self.whole}
-        stages = [*dict.fromkeys([*self.stages, *kept])]
-        written = write_json(self.paths.results / "stages.json", {name: kept[name] for name in stages if name in kept})
+        minutes = {**self.stored, **self.whole}
+        stages = [*dict.fromkeys([*self.stages, *minutes])]
+        ordered = {name: minutes[name] for name in stages if name in minutes}
+        written = write_json(self.paths.results / "stages.json", ordered)
         self.whole, self.begun = {}, []
         self._write("")
         return written
@@ -69,8 +70,8 @@ class Run:
     def _write(self, now: str, **times: float) -> None:
         """Say in run.json which stage it is in, since when (s since 1970), and what was done."""
         self.times |= times
-        said = {"stages": self.stages, "now": now, **self.times, "minutes": self.minutes}
-        write_json(find_run(self.paths) / "run.json", {**said, "whole": self.whole, "begun": self.begun})
+        state = {"stages": self.stages, "now": now, **self.times, "minutes": self.minutes}
+        write_json(find_run(self.paths) / "run.json", {**state, "whole": self.whole, "begun": self.begun})
 
 
 def load_state(paths: Paths) -> dict[str, Any]:
@@ -97,8 +98,8 @@ def estimate_left(state: Mapping[str, Any], stored: Mapping[str, float], elapsed
     now, rest = state["now"], [name for name in state["stages"] if name not in state["minutes"]]
     if not all(stored.get(name) for name in rest):
         return None
-    known = [name for name in state["whole"] if stored.get(name)]
-    took, expected = (sum(minutes[name] for name in known) for minutes in (state["whole"], stored))
+    timed = [name for name in state["whole"] if stored.get(name)]
+    took, expected = (sum(minutes[name] for name in timed) for minutes in (state["whole"], stored))
     pace = took / expected if expected else 1.0
     present = stored[now] if now else 0.0
     if present:
@@ -106,7 +107,7 @@ def estimate_left(state: Mapping[str, Any], stored: Mapping[str, float], elapsed
     return pace * sum(stored[name] for name in rest if name != now) + max(0.0, pace * present - elapsed)
 
 
-def _has_made(paths: Paths, since: float) -> bool:
+def _has_new_files(paths: Paths, since: float) -> bool:
     """Whether anything but locks and executed notebooks was generated after a time (s since 1970)."""
     for path in paths.generated.rglob("[!.]*"):
         with contextlib.suppress(FileNotFoundError):  # of another process

@@ -30,8 +30,8 @@ def list_claims(results: Results) -> list[Claim]:
 
 def make_findings(results: Results) -> str:
     """A Markdown list of the main findings, each with a link to its section of the results page."""
-    found = sorted((f for study in list_studies() for f in study.findings), key=lambda finding: finding.place)
-    return "\n".join(f"- [**{f.name}**]({DETAIL}#{f.section}){f.sentence.format(**f.count(results))}" for f in found)
+    findings = sorted((f for study in list_studies() for f in study.findings), key=lambda finding: finding.place)
+    return "\n".join(f"- [**{f.name}**]({DETAIL}#{f.section}){f.sentence.format(**f.count(results))}" for f in findings)
 
 
 def describe_claims(results: Results) -> Table:
@@ -45,9 +45,9 @@ def describe_claims(results: Results) -> Table:
     for study in list_studies():
         for claim in (judge(results) for judge in study.claims):
             measured = "no results for this preset" if claim.verdict == NOT_MEASURED else claim.measured
-            said = {"rule": claim.rule, "verdict": f"**{claim.verdict}**", "measured": measured}
+            cells = {"rule": claim.rule, "verdict": f"**{claim.verdict}**", "measured": measured}
             command = claim.command or f"`{study.notebook}`"
-            rows[claim.claim] = {"": {**said, "command": command, "minutes": sum_minutes(results, claim)}}
+            rows[claim.claim] = {"": {**cells, "command": command, "minutes": sum_minutes(results, claim)}}
     return Table("claim", {"": columns}, rows)
 
 
@@ -58,14 +58,14 @@ def sum_minutes(results: Results, claim: Claim) -> str:
         rows = results.get(claim.runs, {})
         parts = [rows[name] for name in OBJECTS if name in rows] or [rows]
         runs = [row.get("run") for part in parts for row in part.values()]
-    known = [run["minutes"] for run in runs if run]
-    return f"{sum(known):.0f}" if known else "–"
+    minutes = [run["minutes"] for run in runs if run]
+    return f"{sum(minutes):.0f}" if minutes else "–"
 
 
 def list_tables() -> dict[str, Shown]:
     """{name by which documents mark it: table or sentence} of all studies, and of what is made from all of them."""
-    found = {name: shown for study in list_studies() for name, shown in study.tables.items()}
-    return found | {"findings": Shown("paper", make_findings), "claims": Shown("paper", describe_claims)}
+    tables = {name: table for study in list_studies() for name, table in study.tables.items()}
+    return tables | {"findings": Shown("paper", make_findings), "claims": Shown("paper", describe_claims)}
 
 
 def update_tables(document: Path, results: Path) -> None:
@@ -74,13 +74,13 @@ def update_tables(document: Path, results: Path) -> None:
     Raises ValueError where the file marks no table, or one that `list_tables` does not have, DamagedFileError where a
     results file is damaged.
     """
-    known = list_tables()
+    entries = list_tables()
 
     def fill(marked: re.Match[str]) -> str:
         """What stands between two marks, made anew."""
-        if marked["name"] not in known:
-            raise ValueError(f"{document} marks a table {marked['name']!r}, accepted are {', '.join(known)}")
-        file, make = known[marked["name"]].file, known[marked["name"]].make
+        if marked["name"] not in entries:
+            raise ValueError(f"{document} marks a table {marked['name']!r}, accepted are {', '.join(entries)}")
+        file, make = entries[marked["name"]].file, entries[marked["name"]].make
         with told_where(results / file if isinstance(file, str) else results):
             return marked["begin"] + to_markdown(make(_read(results, file))) + marked["end"]
 

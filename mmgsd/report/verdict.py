@@ -25,7 +25,7 @@ from mmgsd.studies.registry import Measure, list_studies, read_table, told_where
 DEVIATIONS = 3  # of the seeds: as far as another training of the same model may be
 MINUTES = ("runs.json", "stages.json")  # hold minutes, which are others each time
 EQUAL, AGREES, DIFFERS, MISSING, NEW, NOT_RUN = "equal", "agrees", "differs", "missing", "new", "not run here"
-SHOWN = 5  # differing numbers that the summary names
+MAX_LISTED = 5  # differing numbers that the summary names
 NO_MEANING = "Nothing is learnt in smoke, so its numbers mean nothing: they show only that every stage runs.\n"
 
 
@@ -46,22 +46,22 @@ def keep_stored(paths: Paths) -> None:
     state = load_stored(paths)
     if state["running"]:
         return
-    found = {name: digest for name, digest in digest_files(paths).items() if digest != state["after"].get(name)}
-    tables = [name for name in found if Path(name).suffix == ".json"]
+    digests = {name: digest for name, digest in digest_files(paths).items() if digest != state["after"].get(name)}
+    tables = [name for name in digests if Path(name).suffix == ".json"]
     results = state["results"] | {Path(name).stem: read_table(paths.root / name) for name in tables}
-    taken = {"running": True, "before": state["before"] | found, "after": {}, "results": results}
+    taken = {"running": True, "before": state["before"] | digests, "after": {}, "results": results}
     write_json(_find_stored(paths), taken)
 
 
 def judge_run(paths: Paths) -> Verdict:
     """Compare a finished run with what was stored when it began, and keep the summary as verdict.txt."""
     state, now = load_stored(paths), digest_files(paths)
-    found = {path.stem: read_table(path) for path in sorted(paths.results.glob("*.json"))}
+    measured = {path.stem: read_table(path) for path in sorted(paths.results.glob("*.json"))}
     with told_where(paths.results):
-        numbers = compare_numbers(state["results"], found, paths)
+        numbers = compare_numbers(state["results"], measured, paths)
     files = compare_files(state["before"], now)
     hardware = [sorted({run["hardware"] for run in results.get("runs", {}).values()})
-                for results in (state["results"], found)]  # fmt: skip
+                for results in (state["results"], measured)]  # fmt: skip
     summary = summarise(numbers, files, hardware=hardware, meaningless=paths.preset == "smoke", stored=state["before"])
     write_text(find_run(paths) / "verdict.txt", summary)
     write_json(_find_stored(paths), {**state, "running": False, "after": now})
@@ -84,9 +84,9 @@ def load_stored(paths: Paths) -> dict[str, Any]:
 
 def digest_files(paths: Paths) -> dict[str, str]:
     """{path from the root: SHA-256} of a preset's results and figures."""
-    shown = (paths.root / "figures" / "data").glob(f"{paths.preset}_*")
-    found = [*paths.results.glob("*"), *paths.figures.glob("*"), *shown]
-    files = sorted(path for path in found if path.is_file() and not path.name.startswith("."))
+    figure_data = (paths.root / "figures" / "data").glob(f"{paths.preset}_*")
+    outputs = [*paths.results.glob("*"), *paths.figures.glob("*"), *figure_data]
+    files = sorted(path for path in outputs if path.is_file() and not path.name.startswith("."))
     return {path.relative_to(paths.root).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
@@ -95,39 +95,40 @@ def list_measures() -> dict[str, Measure]:
     return {name: measure for study in list_studies() for name, measure in study.compared.items()}
 
 
-def compare_numbers(stored: Mapping[str, Any], found: Mapping[str, Any], paths: Paths) -> pd.DataFrame:
+def compare_numbers(stored: Mapping[str, Any], measured: Mapping[str, Any], paths: Paths) -> pd.DataFrame:
     """A row for each number of either {name of the results file: content}, and whether it agrees.
 
     A trained model's tolerance is 3 standard deviations of its seeds in the stored "seeds", or the object's largest
     where its own are not there, and no less than the floor of its `Measure`, which is that of untrained ones.
     """
-    old, new = (dict(_list_numbers(results)) for results in (stored, found))
+    old, new = (dict(_list_numbers(results)) for results in (stored, measured))
     spreads, measures, rows = measure_spreads(stored.get("seeds", {})), list_measures(), {}
     for key in dict.fromkeys([*new, *old]):
         _, name, row, measure = key
         before, now = old.get(key), new.get(key)
         tolerance = np.nan if before is None else compute_tolerance(measures[measure], name, row, before, spreads)
-        said = judge_number(before, now, tolerance) if _is_made(found, key, paths) or now is None else NOT_RUN
-        rows[key] = {"stored": before, "this run": now, "tolerance": tolerance, "agrees": said}
+        judged = _has_answers(measured, key, paths) or now is None
+        agreement = judge_number(before, now, tolerance) if judged else NOT_RUN
+        rows[key] = {"stored": before, "this run": now, "tolerance": tolerance, "agrees": agreement}
     index = pd.MultiIndex.from_tuples(rows, names=["table", "object", "row", "measure"]) if rows else None
     table = pd.DataFrame(list(rows.values()), index, ["stored", "this run", "tolerance", "agrees"])
     return table.astype({"stored": float, "this run": float, "tolerance": float})
 
 
-def judge_number(stored: float | None, found: float | None, tolerance: float) -> str:
+def judge_number(stored: float | None, measured: float | None, tolerance: float) -> str:
     """The word for a number of this run beside the stored one; None where there is none."""
-    if stored is None or found is None:
+    if stored is None or measured is None:
         return NEW if stored is None else MISSING
-    if np.array_equal(stored, found, equal_nan=True):
+    if np.array_equal(stored, measured, equal_nan=True):
         return EQUAL
-    return AGREES if abs(found - stored) <= tolerance else DIFFERS
+    return AGREES if abs(measured - stored) <= tolerance else DIFFERS
 
 
 def measure_spreads(seeds: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> dict[tuple[str, str, str], float]:
     """{(object, method, measure): std over the seeds}, from {object: {"mmgsd-0": errors}}; none of a single seed."""
-    known = {measure.like for measure in list_measures().values()}
+    compared = {measure.like for measure in list_measures().values()}
     rows = [(name, key.rpartition("-")[0], measure, value) for name, keyed in seeds.items()
-            for key, row in keyed.items() for measure, value in row.items() if measure in known]  # fmt: skip
+            for key, row in keyed.items() for measure, value in row.items() if measure in compared]  # fmt: skip
     table = pd.DataFrame(rows, columns=["object", "method", "measure", "value"]).astype({"value": float})
     return table.groupby(["object", "method", "measure"])["value"].std().dropna().to_dict()
 
@@ -146,8 +147,8 @@ def compute_tolerance(
 def compare_files(before: Mapping[str, str], now: Mapping[str, str]) -> pd.DataFrame:
     """The files, by {path: digest}, that a run changed: "written anew", "new" or "gone"."""
     names = [name for name in sorted({*before, *now}) if before.get(name) != now.get(name)]
-    said = ["new" if name not in before else "written anew" if name in now else "gone" for name in names]
-    return pd.DataFrame({"file": said}, pd.Index(names, name="path"), dtype=object)
+    changes = ["new" if name not in before else "written anew" if name in now else "gone" for name in names]
+    return pd.DataFrame({"file": changes}, pd.Index(names, name="path"), dtype=object)
 
 
 def summarise(
@@ -160,10 +161,10 @@ def summarise(
     agree = compared - int(count.get(DIFFERS, 0))
     lines = [f"Verdict: {agree} of {compared} numbers agree with the stored ones; {count.get(EQUAL, 0)} are equal."]
     differing = numbers[numbers["agrees"] == DIFFERS]
-    lines += [_describe(key, row) for key, row in differing.head(SHOWN).iterrows()]
-    lines += [f"  … and {len(differing) - SHOWN} more, in the table"] if len(differing) > SHOWN else []
-    said = {MISSING: "stored and missing in this run", NEW: "new", NOT_RUN: "of models that this run does not make"}
-    others = [f"{count[word]} {text}" for word, text in said.items() if word in count]
+    lines += [_describe(key, row) for key, row in differing.head(MAX_LISTED).iterrows()]
+    lines += [f"  … and {len(differing) - MAX_LISTED} more, in the table"] if len(differing) > MAX_LISTED else []
+    reasons = {MISSING: "stored and missing in this run", NEW: "new", NOT_RUN: "of models that this run does not make"}
+    others = [f"{count[word]} {text}" for word, text in reasons.items() if word in count]
     lines += [f"Not compared: {', '.join(others)}."] if others else []
     lines.append(_describe_hardware(*hardware))
     lines.append(_describe_files(files, len(stored)))
@@ -211,8 +212,8 @@ def _walk(
             yield (", ".join(keys[:-2]), *keys[-2:], name), float(value)
 
 
-def _is_made(found: Mapping[str, Any], key: tuple[str, ...], paths: Paths) -> bool:
+def _has_answers(results: Mapping[str, Any], key: tuple[str, ...], paths: Paths) -> bool:
     """Whether the answers that a number is of are here; where not, a table of results keeps the stored row."""
     table, name, row, _ = key
-    run = get(found, table, name, row, "run") or get(found, "runs", f"{name}-{row}")
+    run = get(results, table, name, row, "run") or get(results, "runs", f"{name}-{row}")
     return paths.queries(run["model"] if run else f"{name}-{row}").is_file()

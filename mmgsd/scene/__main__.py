@@ -70,7 +70,7 @@ def silenced() -> Iterator[None]:
     """Send what C code prints to nowhere; Python's own stderr is back before a traceback is printed."""
     sys.stdout.flush()
     sys.stderr.flush()
-    kept = [os.dup(fd) for fd in (1, 2)]
+    originals = [os.dup(fd) for fd in (1, 2)]
     nowhere = os.open(os.devnull, os.O_WRONLY)
     try:
         for fd in (1, 2):
@@ -78,7 +78,7 @@ def silenced() -> Iterator[None]:
         yield
     finally:
         sys.stdout.flush()
-        for fd, original in zip((1, 2), kept, strict=True):
+        for fd, original in zip((1, 2), originals, strict=True):
             os.dup2(original, fd)
             os.close(original)
         os.close(nowhere)

@@ -131,10 +131,10 @@ def _enable_gpu() -> bool:
         except TypeError:  # this build of Blender does not know the backend
             continue
         preferences.refresh_devices()
-        found = [device for device in preferences.devices if device.type == backend]
+        devices = [device for device in preferences.devices if device.type == backend]
         for device in preferences.devices:
-            device.use = device in found
-        if found:
+            device.use = device in devices
+        if devices:
             return True
     return False
 

@@ -58,10 +58,10 @@ def aim_lamp(
 def list_maps() -> list[Path]:
     """The environment maps that Blender's module brings, by name; SceneError where it brings none."""
     folder = Path(bpy.utils.resource_path("LOCAL")) / "datafiles" / "studiolights" / "world"
-    found = sorted(folder.glob("*.exr"))
-    if not found:
+    maps = sorted(folder.glob("*.exr"))
+    if not maps:
         raise SceneError(f"Blender {bpy.app.version_string} brings no environment maps in {folder}")
-    return found
+    return maps
 
 
 @functools.cache

@@ -56,8 +56,8 @@ def list_cells(
     """What is measured of {object: photographs}, the weights as they are first in each split."""
     for name, all_of_it in photographs.items():
         for repository, number in Counter(photograph.source for photograph in all_of_it).items():
-            kept = [count for count in counts if count <= find_most(number)]
-            ways = [("marked", 0), *((kind, count) for count in kept for kind in KINDS)] if kept else []
+            feasible = [count for count in counts if count <= find_most(number)]
+            ways = [("marked", 0), *((kind, count) for count in feasible for kind in KINDS)] if feasible else []
             yield from ((name, repository, *way, split) for split in range(splits) for way in ways)
 
 
@@ -116,14 +116,14 @@ def _ask(matcher: Matcher, sources: list[Photograph], targets: Mapping[str, list
 def tabulate(results: Results) -> pd.DataFrame:
     """A row a cell, place ("own", "others") and way of asking; of cells that were not refused."""
     rows = []
-    for key, found in results.items():
+    for key, outcome in results.items():
         object, rest = key.split("/", 1)
         repository, kind, count, split = rest.rsplit("/", 3)
-        error = found.get("rmse_px")
-        told = {"object": object, "repository": repository, "kind": kind, "count": int(count), "split": int(split),
-                "grown": error["after"] / error["before"] - 1 if error else 0.0}  # fmt: skip
+        error = outcome.get("rmse_px")
+        columns = {"object": object, "repository": repository, "kind": kind, "count": int(count), "split": int(split),
+                   "grown": error["after"] / error["before"] - 1 if error else 0.0}  # fmt: skip
         for place in ASKED:
-            rows += [{**told, "place": place, "by": by, **means} for by, means in found.get(place, {}).items()]
+            rows += [{**columns, "place": place, "by": by, **means} for by, means in outcome.get(place, {}).items()]
     return pd.DataFrame(rows)
 
 
@@ -173,11 +173,11 @@ def plot_adaptation(results: Results) -> Figure | None:
     figure, axes = plt.subplots(1, len(panels), figsize=size, layout="constrained", sharey=True, squeeze=False)
     for axis, ((object, repository), part) in zip(axes[0], panels, strict=True):
         for (kind, label), by in product(KINDS.items(), LABELS):
-            found = part[((part.kind == kind) | (part["count"] == 0)) & (part.by == by)]
-            mean, line = 100 * found.groupby("count")["found@5%"].mean(), "o-" if by == "name" else "o--"
+            curve = part[((part.kind == kind) | (part["count"] == 0)) & (part.by == by)]
+            mean, line = 100 * curve.groupby("count")["found@5%"].mean(), "o-" if by == "name" else "o--"
             axis.plot(mean.index, mean, line, ms=3.5, mfc=COLOURS[kind] if by == "name" else "white",
                       color=COLOURS[kind], label=f"{label}, {LABELS[by]}")  # fmt: skip
-            axis.scatter(found["count"], 100 * found["found@5%"], s=4, color=COLOURS[kind], linewidths=0)
+            axis.scatter(curve["count"], 100 * curve["found@5%"], s=4, color=COLOURS[kind], linewidths=0)
         name = textwrap.shorten(repository.rpartition("/")[2].replace("-", " "), 24, placeholder=" …")
         axis.set(title=f"{object}\n{name}", xlabel="photographs learnt from", ylim=(0, 103))
         axis.set_xticks(sorted(part["count"].unique()))
@@ -202,5 +202,5 @@ def main(
     out: Annotated[Path, Option("another results file")] | None = None,
 ) -> None:
     """Measure what is missing, and print the table."""
-    asked = {"objects": object or OBJECTS, "counts": counts, "splits": splits, "steps": steps, "out": out}
-    print(to_markdown(describe_adaptation(read_results(run(Paths(find_root(), "paper"), folder=folder, **asked)))))
+    options = {"objects": object or OBJECTS, "counts": counts, "splits": splits, "steps": steps, "out": out}
+    print(to_markdown(describe_adaptation(read_results(run(Paths(find_root(), "paper"), folder=folder, **options)))))

@@ -19,10 +19,10 @@ from mmgsd.studies.table import Column, Table, say_value
 
 def describe_backbones(rows: Rows) -> Table:
     """`describe_pictures` of the models of each trunk that were measured, and the time of a question (ms)."""
-    known = {f"{object}-{row.name}": row.label for object in OBJECTS for row in list_rows("backbones")}
-    table = describe_pictures(rows, {name: label for name, label in known.items() if name in rows})
+    labels = {f"{object}-{row.name}": row.label for object in OBJECTS for row in list_rows("backbones")}
+    table = describe_pictures(rows, {name: label for name, label in labels.items() if name in rows})
     columns = [*table.blocks[""], Column("time", page="ms a question")]
-    times = {f"{name.partition('-')[0]}, {label}": rows[name] for name, label in known.items() if name in rows}
+    times = {f"{name.partition('-')[0]}, {label}": rows[name] for name, label in labels.items() if name in rows}
     lines = {label: {"": row[""] | {"time": say_value(times.get(label), "milliseconds", 1, ".0f")}}
              for label, row in table.rows.items()}  # fmt: skip
     return dataclasses.replace(table, blocks={"": columns}, rows=lines)

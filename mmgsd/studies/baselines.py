@@ -32,12 +32,12 @@ def judge_hand_made(results: Results) -> Claim:
     names = {"mmgsd": "MMGSD with dense supervision", "mmgsd_plain": "MMGSD"}
     shares = {m: {n: get(results, "rmse", n, m, "pck@20px") for n in OBJECTS} for m in (*HAND_MADE, *names)}
     parts = tuple(fails(shares[m][n]) for m in HAND_MADE for n in OBJECTS)
-    shown = [f"{names.get(m, m.upper())} {' / '.join(say(v, 'percent') for v in row.values())}"
+    texts = [f"{names.get(m, m.upper())} {' / '.join(say(v, 'percent') for v in row.values())}"
              for m, row in shares.items()]  # fmt: skip
     return Claim(
         "hand-made", "SIFT, SURF and ORB fail.",
         f"They find fewer than {100 * FOUND:.0f} % of the matches within 20 px; a part each method and object.",
-        f"found, cloth / rope: {', '.join(shown)}", parts,
+        f"found, cloth / rope: {', '.join(texts)}", parts,
     )  # fmt: skip
 
 

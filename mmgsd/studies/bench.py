@@ -123,8 +123,8 @@ class Bench:
                 self.acted.setdefault(arm, []).append((files[arm], answers[arm][-1]))
             names = {arm: f"{arm[0].name}-{arm[1].name}-{number}" for arm in going}
             jobs = {names[arm]: act_job(files[arm], answers[arm][-1].moves.tolist()) for arm in going}
-            made = run_jobs(jobs, self.folder / "acts", **self.how)
-            files |= {arm: made[name] for arm, name in names.items()}
+            new_files = run_jobs(jobs, self.folder / "acts", **self.how)
+            files |= {arm: new_files[name] for arm, name in names.items()}
         self.ends |= files
         return {policy.name: {rollout.name: self.judge(rollout, files[policy, rollout], answers[policy, rollout])
                               for rollout in rollouts} for policy in policies}  # fmt: skip
@@ -137,29 +137,29 @@ class Bench:
         for again in range(1, max(policy.looks for policy, _ in going)):
             unsure = [arm for arm in going if arm[0].looks > again and answers[arm][-1].share < AGREES]
             names = {arm: f"{arm[0].name}-{arm[1].name}-{number}-look{again}" for arm in unsure}
-            made = run_jobs({names[arm]: look_job(first[arm], again) for arm in unsure}, self.folder / "acts",
-                            **self.how)  # fmt: skip
+            look_files = run_jobs({names[arm]: look_job(first[arm], again) for arm in unsure}, self.folder / "acts",
+                                  **self.how)  # fmt: skip
             for arm in unsure:
-                file = made[names[arm]]
+                file = look_files[names[arm]]
                 answer = self._answer(*arm, number, file, answers[arm][:-1], again=again)
                 if answer.share > answers[arm][-1].share:
                     files[arm], answers[arm][-1] = file, answer
 
     def list_pictures(
         self, policies: list[Policy], rollouts: Mapping[str, Rollout], starts: dict[Rollout, Path],
-        found: Mapping[str, Mapping[str, Mapping[str, Any]]],
+        outcomes: Mapping[str, Mapping[str, Mapping[str, Any]]],
     ) -> dict[str, dict[str, np.ndarray]]:  # fmt: skip
         """{task's label: {what is seen: picture}} of a rollout of each task: demonstration, start, policies' ends.
 
-        ``found`` is as `roll` gives it: the ends are framed by whether they are a success.
+        ``outcomes`` are as `roll` gives them: the ends are framed by whether they are a success.
         """
         rows = {}
         for task in (task for task in TASKS.values() if task.name in rollouts):
-            shown, rollout = self.demonstrated[task.name], rollouts[task.name]
-            row = {"demonstrated": shown[0].image, "its end": shown[-1].image,
+            demo_states, rollout = self.demonstrated[task.name], rollouts[task.name]
+            row = {"demonstrated": demo_states[0].image, "its end": demo_states[-1].image,
                    "found": read_state(starts[rollout]).image}  # fmt: skip
             for policy in (policy for policy in policies if policy.looks == 1):  # looking again mostly changes nothing
-                success = found[policy.name][rollout.name]["success"]
+                success = outcomes[policy.name][rollout.name]["success"]
                 row[policy.label] = mark_success(read_state(self.ends[policy, rollout]).image, success)
             rows[task.label] = row
         return rows
@@ -168,10 +168,10 @@ class Bench:
         """Of a rollout of each task, look by look and at its end: the demonstration's picture and the policy's."""
         slides = []
         for task in (task for task in TASKS.values() if task.name in rollouts):
-            shown, arm = self.demonstrated[task.name], (policy, rollouts[task.name])
+            demo_states, arm = self.demonstrated[task.name], (policy, rollouts[task.name])
             for look, (file, answer) in zip(self.make_demonstration(task).looks, self.acted[arm], strict=True):
                 slides.append((mark_moves(look.image, look.moves), mark_moves(read_state(file).image, answer.moves)))
-            slides.append((shown[-1].image, read_state(self.ends[arm]).image))
+            slides.append((demo_states[-1].image, read_state(self.ends[arm]).image))
         return slides
 
     def _answer(
@@ -182,26 +182,26 @@ class Bench:
         look = f"-look{again}" if again else ""
         place = self.folder / "answers" / f"{policy.name}-{rollout.name}-{number}{look}.json"
         mark = {"state": state.about["mark"], "policy": digest_policy(policy, task.object)}
-        kept = read_kept(place, mark)
-        if kept is None:
+        stored = read_kept(place, mark)
+        if stored is None:
             answer = self._ask(policy, rollout, number, state, before[0].motion if before else None)
             parts = answer.motion and (answer.motion.factor, answer.motion.shift)
             motion = parts and [[value.real, value.imag] for value in parts]
-            kept = {"mark": mark, "moves": answer.moves.tolist(), "motion": motion, "share": answer.share}
-            write_json(place, kept)
-        motion = kept["motion"] and Motion(*(complex(*pair) for pair in kept["motion"]))
-        return PolicyAnswer(np.array(kept["moves"], float).reshape(-1, 2, 2), motion, kept["share"])
+            stored = {"mark": mark, "moves": answer.moves.tolist(), "motion": motion, "share": answer.share}
+            write_json(place, stored)
+        motion = stored["motion"] and Motion(*(complex(*pair) for pair in stored["motion"]))
+        return PolicyAnswer(np.array(stored["moves"], float).reshape(-1, 2, 2), motion, stored["share"])
 
     def _ask(self, policy: Policy, rollout: Rollout, number: int, state: State, motion: Motion | None) -> PolicyAnswer:
         task = find_task(rollout.task)
-        shown = self.demonstrated[task.name]
+        demo_states = self.demonstrated[task.name]
         look = self.make_demonstration(task).looks[number]
         if policy.name == "truth":
-            return PolicyAnswer(np.array(true_moves(task.looks[number], shown[0].points, state)), None, 1.0)
+            return PolicyAnswer(np.array(true_moves(task.looks[number], demo_states[0].points, state)), None, 1.0)
         if policy.name == "random":
             return PolicyAnswer(draw_moves(look, state.mask, np.random.default_rng([rollout.seed, number])), None, 1.0)
         match = ask(policy, task.object, look, state.image, state.mask)
-        answer = choose_moves(look, match, policy.chosen, lambda xy: find_on_table(xy, shown[number]),
+        answer = choose_moves(look, match, policy.chosen, lambda xy: find_on_table(xy, demo_states[number]),
                               lambda xy: find_on_table(xy, state), motion=motion)  # fmt: skip
         moves = answer.moves.reshape(-1, 2)
         pixels = state.project(np.column_stack([moves, np.zeros(len(moves))])) if len(moves) else moves
@@ -224,9 +224,9 @@ def choose_shown(rollouts: list[Rollout], ended: Mapping[str, Mapping[str, Any]]
     tasks: dict[str, list[Rollout]] = {}
     for rollout in rollouts:
         tasks.setdefault(rollout.task, []).append(rollout)
-    for found in tasks.values():
-        found.sort(key=lambda rollout: ended[rollout.name]["error"] if rollout.name in ended else 0.0)
-    return {task: found[len(found) // 2] for task, found in tasks.items()}
+    for candidates in tasks.values():
+        candidates.sort(key=lambda rollout: ended[rollout.name]["error"] if rollout.name in ended else 0.0)
+    return {task: candidates[len(candidates) // 2] for task, candidates in tasks.items()}
 
 
 def find_on_table(xy: np.ndarray, state: State) -> np.ndarray:
@@ -243,37 +243,37 @@ def summarise_rollouts(rows: dict[str, dict[str, Any]], reachable: set[str]) -> 
     """
     groups = {"all": list(rows.values()), "reachable": [row for name, row in rows.items() if name in reachable]}
     groups |= {task: [row for row in rows.values() if row["task"] == task] for task in TASKS}
-    said = {
-        name: {key: estimate_mean([min(row[key], 1.0) for row in found]) for key in ("error", "overlap")}
-        | {"success": estimate_share([row["success"] for row in found])}
-        for name, found in groups.items()
-        if found
+    summary = {
+        name: {key: estimate_mean([min(row[key], 1.0) for row in group]) for key in ("error", "overlap")}
+        | {"success": estimate_share([row["success"] for row in group])}
+        for name, group in groups.items()
+        if group
     }
     sure = [row["success"] for name, row in rows.items() if row["share"] >= AGREES and name in reachable]
     each = {name: [round(min(row["error"], 1.0), 4), bool(row["success"])] for name, row in rows.items()}
     faults = sum(bool(row["fault"]) for row in rows.values())
-    return {**said, "cautious": estimate_share(sure), "faults": faults, "rollouts": each}
+    return {**summary, "cautious": estimate_share(sure), "faults": faults, "rollouts": each}
 
 
 def summarise_policies(
-    stored: Mapping[str, Any], found: Mapping[str, dict[str, dict[str, Any]]]
+    stored: Mapping[str, Any], outcomes: Mapping[str, dict[str, dict[str, Any]]]
 ) -> dict[str, dict[str, Any]]:
-    """Rows of the policies whose rollouts were ``found`` to end so, and of others that are ``stored``, in their order.
+    """Rows of the policies whose rollouts had these ``outcomes``, and of others that are ``stored``, in their order.
 
     Rollouts count that the true matches succeed in, and that are no success where "nothing" is done.
     """
-    reachable = find_reachable(found)
-    rows = {**stored, **{name: summarise_rollouts(ended, reachable) for name, ended in found.items()}}
+    reachable = find_reachable(outcomes)
+    rows = {**stored, **{name: summarise_rollouts(ended, reachable) for name, ended in outcomes.items()}}
     if REFERENCE in rows:
         for row in rows.values():
             row["beyond"] = compare_rollouts(rows[REFERENCE]["rollouts"], row["rollouts"], reachable)
     return {name: rows[name] for name in POLICIES if name in rows}
 
 
-def find_reachable(found: Mapping[str, dict[str, dict[str, Any]]]) -> set[str]:
+def find_reachable(outcomes: Mapping[str, dict[str, dict[str, Any]]]) -> set[str]:
     """Names of the rollouts that count: the true matches succeed in them, and doing "nothing" does not."""
-    done = {name for name, row in found["nothing"].items() if row["success"]}
-    return {name for name, row in found.get("truth", {}).items() if row["success"]} - done
+    done = {name for name, row in outcomes["nothing"].items() if row["success"]}
+    return {name for name, row in outcomes.get("truth", {}).items() if row["success"]} - done
 
 
 def measure_success(
@@ -281,12 +281,12 @@ def measure_success(
 ) -> dict[str, dict[str, Any]]:  # fmt: skip
     """{policy: share of successes with its interval} over those of some rollouts that count."""
     starts = bench.make_starts(list(rollouts))
-    kept = [rollout for rollout in starts if not read_state(starts[rollout]).about["fault"]]
-    found = bench.roll([POLICIES["truth"], *policies], kept, starts)
-    untouched = {rollout.name: bench.judge(rollout, starts[rollout], []) for rollout in kept}
-    reachable = find_reachable({"nothing": untouched} | found)
+    faultless = [rollout for rollout in starts if not read_state(starts[rollout]).about["fault"]]
+    outcomes = bench.roll([POLICIES["truth"], *policies], faultless, starts)
+    untouched = {rollout.name: bench.judge(rollout, starts[rollout], []) for rollout in faultless}
+    reachable = find_reachable({"nothing": untouched} | outcomes)
     return {name: estimate_share([row["success"] for key, row in ended.items() if key in reachable])
-            for name, ended in found.items()}  # fmt: skip
+            for name, ended in outcomes.items()}  # fmt: skip
 
 
 def read_kept(path: Path, mark: Mapping[str, Any]) -> dict[str, Any] | None:

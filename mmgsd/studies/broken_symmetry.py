@@ -59,9 +59,9 @@ def _measure(paths: Paths, object: str, row: Model, images: str, *, overwrite: b
     scene = dataclasses.replace(config.render[object], **row.scene)
     data = render_dataset(scene, place.dataset(f"{object}{suffix}"), **how)
     weights = train_model(model, data, place.generated / "models" / f"{model.name}{suffix}", **how)
-    told = {"modes": load_group(object, DEFAULT_GROUP[object]).order, **how}
+    options = {"modes": load_group(object, DEFAULT_GROUP[object]).order, **how}
     files = [evaluate_model(weights, data, config.evaluate, place.queries(f"{model.name}{suffix}-{group}"), group=group,
-                            **told) for group in (TOLD, DEFAULT_GROUP[object])]  # fmt: skip
+                            **options) for group in (TOLD, DEFAULT_GROUP[object])]  # fmt: skip
     own, every = map(load_queries, files)
     nearest, several = every.nearest_px[own.visible], every.n[own.visible] > 1
     right = (own.rmse_px[own.visible] <= nearest + RIGHT_PX)[several].mean()

@@ -17,23 +17,23 @@ from mmgsd.studies.registry import Results
 def measure_weights(
     paths: Paths, results: str, weights: str, split: str, measure: Callable[[Matcher, Dataset], Results]
 ) -> Path:
-    """Add what ``measure`` finds with weights to {weights: {preset: found}}, a file beside the presets' folders."""
+    """Add what ``measure`` gives with weights to {weights: {preset: measured}}, a file beside the presets' folders."""
     matcher, file = load(weights), paths.results.parent / results
     for preset in (paths.preset, load_preset(paths.preset).cluttered):
-        found = measure(matcher, load_dataset(Paths(paths.root, preset).dataset(matcher.object), split))
+        measured = measure(matcher, load_dataset(Paths(paths.root, preset).dataset(matcher.object), split))
         rows = read_results(file, depth=3)
-        rows.setdefault(weights, {})[preset] = found
+        rows.setdefault(weights, {})[preset] = measured
         write_results(rows, file)
     return file
 
 
 def list_parts(results: Results) -> dict[str, Any]:
-    """{"cloth, round2": what was found} of such a file."""
-    return {f"{weights}, {images}": found for weights, every in results.items() for images, found in every.items()}
+    """{"cloth, round2": its values} of such a file."""
+    return {f"{weights}, {images}": values for weights, every in results.items() for images, values in every.items()}
 
 
 def list_rows(results: Results, labels: Mapping[str, str]) -> dict[str, dict[str, Any]]:
     """{label: {part: what it has}} of the keys that some part has."""
     parts = list_parts(results)
-    rows = {label: {part: found[key] for part, found in parts.items() if key in found} for key, label in labels.items()}
+    rows = {label: {part: each[key] for part, each in parts.items() if key in each} for key, label in labels.items()}
     return {label: row for label, row in rows.items() if row}

@@ -45,8 +45,8 @@ def measure_jumps(matcher: Matcher, data: Dataset, *, config: EvaluateConfig = P
         neighbours = _list_neighbours(offsets, data)
         difference = np.concatenate([np.linalg.norm(a - b, axis=-1).ravel() for a, b in neighbours])
         jumps.append(difference[np.isfinite(difference)] > JUMP_PX)
-    found = np.concatenate(jumps)
-    return {"jumps": round(float(found.mean()), 4), "neighbours": len(found)}
+    is_jump = np.concatenate(jumps)
+    return {"jumps": round(float(is_jump.mean()), 4), "neighbours": len(is_jump)}
 
 
 def _list_neighbours(offsets: np.ndarray, data: Dataset) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -68,12 +68,12 @@ def judge_continuous(results: Results) -> Claim:
     """Whether neighbouring pixels have neighbouring matches."""
     jumps = {m: {name: get(results, "continuity", name, m, "jumps") for name in OBJECTS} for m in PAPER_SIZE}
     parts = (*(is_better(jumps["mmgsd"][name], jumps["spcl"][name]) for name in OBJECTS), None)
-    shown = [f"{m.upper()}: {list_shares(row, 'permille')}" for m, row in jumps.items()]
+    texts = [f"{m.upper()}: {list_shares(row, 'permille')}" for m, row in jumps.items()]
     return Claim(
         "continuous", "SPCL's answers are discontinuous; MMGSD's are more continuous.",
         "Fewer of MMGSD's matches jump from one material point to its neighbour, a part each object; so they do where "
         "both have dense supervision, or neither, a part not measured.",
-        f"jumps, {'; '.join(shown)}; MMGSD with dense supervision, SPCL without; the sample's images, one seed", parts,
+        f"jumps, {'; '.join(texts)}; MMGSD with dense supervision, SPCL without; the sample's images, one seed", parts,
         "`.venv/bin/python -m mmgsd run continuity`", PAPER_SIZE,
     )  # fmt: skip
 

@@ -161,12 +161,12 @@ def judge_hidden(results: Results) -> Claim:
     nats["rope"] = nats["rope"] | ({OTHERS: statistics.mean(others)} if others else {})
     pairs = {f"{name}, {high}": (nats[name].get(high), nats[name].get(low), low)
              for name, low, high in (*((name, *SEEN) for name in OBJECTS), ("rope", OTHERS, KNOT))}  # fmt: skip
-    shown = [f"{kind} {say(high, 'share')}, {other} {say(low, 'share')}"
+    texts = [f"{kind} {say(high, 'share')}, {other} {say(low, 'share')}"
              for kind, (high, low, other) in pairs.items()]  # fmt: skip
     return Claim(
         "hidden", "Uncertainty is high at rope knots and at what is occluded.",
         f"MMGSD's entropy is at least {NATS} nats higher where a match is hidden, a part each object, and on knotted "
-        "ropes than in a rope's other states on average, a part.", f"nats, {'; '.join(shown)}; one seed",
+        "ropes than in a rope's other states on average, a part.", f"nats, {'; '.join(texts)}; one seed",
         tuple(is_above(high, low) for high, low, _ in pairs.values()), models=("mmgsd",),
     )  # fmt: skip
 

@@ -60,9 +60,9 @@ def choose_plain(data: Dataset, point: int = 0) -> tuple[int, int]:
 
     Both show all matches of the material ``point``.
     """
-    shown = data.visible[:, data.group().distinct_modes(point)].all(1)
+    visible = data.visible[:, data.group().distinct_modes(point)].all(1)
     plain = data.labels.state.isin(PLAIN).to_numpy()
-    pair = {f"of state {' or '.join(PLAIN)}": shown & plain, "of another state": shown & ~plain}
+    pair = {f"of state {' or '.join(PLAIN)}": visible & plain, "of another state": visible & ~plain}
     for name, images in pair.items():
         if not images.any():
             raise ValueError(f"data must have an image {name} that shows all matches of point {point}: {data.folder}")
@@ -134,13 +134,13 @@ def _first(values: Mapping[str, Any]) -> Any:
 
 def save_figure_data(data: FigureData, path: Path) -> Path:
     """Write a safetensors file; ValueError where the methods did not answer the same queries."""
-    asked, example = _first(data.errors).asked, _first(data.answers)
-    tensors = {"asked": asked} | {TRUE.format(k or ""): true for k, true in enumerate(data.true)}
+    counts, example = _first(data.errors).asked, _first(data.answers)
+    tensors = {"asked": counts} | {TRUE.format(k or ""): true for k, true in enumerate(data.true)}
     for name in _IMAGES:
         image = cv2.cvtColor(getattr(example, name), cv2.COLOR_RGB2BGR)
         tensors[name] = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, EXAMPLE_QUALITY])[1]
     for method, summary in data.errors.items():
-        if not np.array_equal(summary.asked, asked):
+        if not np.array_equal(summary.asked, counts):
             raise ValueError(f"errors[{method!r}] must answer the same queries as the other methods")
         tensors |= {f"errors/{method}/{name}": getattr(summary, name) for name in _SUMMARY}
     tensors |= {"xy": example.xy, "n": np.isfinite(example.modes[..., 0]).sum(1)}

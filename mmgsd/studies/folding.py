@@ -56,18 +56,18 @@ def run(
     for object in OBJECTS:
         rollouts = list_rollouts(object, ROLLOUTS[paths.preset])
         starts = bench.make_starts(rollouts)
-        kept = [rollout for rollout in rollouts if not read_state(starts[rollout]).about["fault"]]
-        found = bench.roll(policies, kept, starts)
-        untouched = {rollout.name: bench.judge(rollout, starts[rollout], []) for rollout in kept}
-        rows[object] = summarise_policies(rows[object], {"nothing": untouched} | found)
-        shown = choose_shown(kept, found.get(REFERENCE, {}))
-        pictures |= bench.list_pictures(policies, shown, starts, found)
-        slides += bench.list_slides(ours, shown) if ours in policies else []
+        faultless = [rollout for rollout in rollouts if not read_state(starts[rollout]).about["fault"]]
+        outcomes = bench.roll(policies, faultless, starts)
+        untouched = {rollout.name: bench.judge(rollout, starts[rollout], []) for rollout in faultless}
+        rows[object] = summarise_policies(rows[object], {"nothing": untouched} | outcomes)
+        examples = choose_shown(faultless, outcomes.get(REFERENCE, {}))
+        pictures |= bench.list_pictures(policies, examples, starts, outcomes)
+        slides += bench.list_slides(ours, examples) if ours in policies else []
     if slides:
         save_figure(plot_rollouts(pictures), paths.figures / "folding", kinds=("jpg",))
         save_slides(slides, paths.figures / "folding.webp")
     results = {"run": {"rollouts": ROLLOUTS[paths.preset]}, "policies": rows}
-    if any("reachable" in row for found in rows.values() for row in found.values()):
+    if any("reachable" in row for by_policy in rows.values() for row in by_policy.values()):
         save_figure(plot_success(results), paths.figures / "folding_success", kinds=("png",))
     return write_json(out, results)
 
@@ -101,9 +101,9 @@ def _list_cells(rows: Mapping[str, Any], name: str) -> list[str]:
     row = rows.get(name, {})
     if "reachable" not in row:
         return [MISSING] * len(HEADS)
-    found, counted = (rows.get(key, row)["reachable"]["success"] for key in (name, "truth"))
-    fewer = f" of {found['count']}" if found["count"] != counted["count"] else ""  # it had not all of the rollouts
-    success = say_share(found) + fewer
+    share, counted = (rows.get(key, row)["reachable"]["success"] for key in (name, "truth"))
+    fewer = f" of {share['count']}" if share["count"] != counted["count"] else ""  # it had not all of the rollouts
+    success = say_share(share) + fewer
     same = say_share(estimate_share(list(_list_like_truth(rows, name).values())))
     error = f"{100 * row['reachable']['error']['mean']:.1f} %"
     return [success, same, error, say_beyond(row["beyond"]["error"])]
@@ -133,18 +133,18 @@ def _list_like_truth(rows: Mapping[str, Any], name: str) -> dict[str, bool]:
 
 def make_folding_sentence(results: Results) -> str:
     """How many rollouts count, and what caution brings."""
-    said = [f"{object.capitalize()}: {_say_object(results['policies'][object])}." for object in OBJECTS]
-    return " ".join(said)
+    sentences = [f"{object.capitalize()}: {_say_object(results['policies'][object])}." for object in OBJECTS]
+    return " ".join(sentences)
 
 
 def _say_object(rows: Mapping[str, Any]) -> str:
     truth = rows["truth"]
     counted = truth["reachable"]["success"]["count"] if "reachable" in truth else 0
-    said = f"{counted} of {truth['all']['success']['count']} rollouts count"
+    text = f"{counted} of {truth['all']['success']['count']} rollouts count"
     sure = get(rows, "mmgsd", "cautious") or {"count": 0}
     if 0 < sure["count"] < counted:  # else caution leaves all of them, or none
-        said += f"; MMGSD succeeds in {100 * sure['mean']:.0f} % of the {sure['count']} whose modes agree most"
-    return said
+        text += f"; MMGSD succeeds in {100 * sure['mean']:.0f} % of the {sure['count']} whose modes agree most"
+    return text
 
 
 def say_share(share: Mapping[str, Any]) -> str:
@@ -173,11 +173,11 @@ def tabulate_errors(results: Results) -> pd.DataFrame:
     return table.pivot_table("error", "policy", ["object", "start"], sort=False)
 
 
-def shorten(folder: Path, found: Results) -> dict[str, Any]:
+def shorten(folder: Path, results: Results) -> dict[str, Any]:
     """{object: {policy: its measures where rollouts count, and ``beyond`` MMGSD's}} in place of all rollouts."""
     return {"folding": {object: {name: {**row["reachable"], "beyond": row["beyond"]} for name, row in policies.items()
                                  if "reachable" in row and "beyond" in row}
-                        for object, policies in found["folding"]["policies"].items()}} if found else {}  # fmt: skip
+                        for object, policies in results["folding"]["policies"].items()}} if results else {}  # fmt: skip
 
 
 def judge_several(results: Results) -> Claim:
@@ -185,14 +185,14 @@ def judge_several(results: Results) -> Claim:
     low = {name: get(results, "folding", name, "mmgsd_best", "beyond", "error", "low") for name in OBJECTS}
     parts = tuple(None if low[name] is None else low[name] <= 0 for name in OBJECTS)
     ways = {"modes that agree": "mmgsd", "surest joint answer": "mmgsd_joint", "each pixel's surest": "mmgsd_best"}
-    shown = []
+    texts = []
     for name in OBJECTS:
         successes = {way: get(results, "folding", name, policy, "success", "mean") for way, policy in ways.items()}
-        shown.append(f"{name}: {list_shares(successes)}")
+        texts.append(f"{name}: {list_shares(successes)}")
     return Claim(
         "several", "Our question: may each of several picks take its own surest match?",
         "Folding by each pixel's surest mode ends no farther off than by modes that agree, as far as the 95 % interval "
-        "of the difference tells; a part each object.", f"successes, {'; '.join(shown)}", parts,
+        "of the difference tells; a part each object.", f"successes, {'; '.join(texts)}", parts,
         "`.venv/bin/python -m mmgsd run folding paper`",
     )  # fmt: skip
 
@@ -207,13 +207,13 @@ def plot_success(results: Mapping[str, Any]) -> Figure:
     for axis, object in zip(axes, OBJECTS, strict=True):
         counted = get(rows, object, "truth", "reachable", "success", "count") or 0
         for place, name in enumerate(names):
-            said = get(rows, object, name, "reachable", "success")
-            if said:
-                mean, low, high = (100 * said[key] for key in ("mean", "low", "high"))
+            share = get(rows, object, name, "reachable", "success")
+            if share:
+                mean, low, high = (100 * share[key] for key in ("mean", "low", "high"))
                 axis.errorbar(mean, place, xerr=[[mean - low], [high - mean]], fmt="o", ms=4, capsize=2,
                               color=POLICIES[name].colour)  # fmt: skip
-                if said["count"] != counted:
-                    axis.annotate(f"of {said['count']}", (high, place), xytext=(5, 0), textcoords="offset points",
+                if share["count"] != counted:
+                    axis.annotate(f"of {share['count']}", (high, place), xytext=(5, 0), textcoords="offset points",
                                   va="center", fontsize=6)  # fmt: skip
         axis.set(title=f"{object.capitalize()}, {counted} rollouts", xlabel="Success (%)", xlim=(-4, 104))
     axes[0].set_yticks(range(len(names)), [POLICIES[name].label.replace("`", "") for name in names])
@@ -247,9 +247,9 @@ def main(
             raise ValueError(f"--only {only!r} must be given with a preset, got {DEMONSTRATIONS}")
         print(*write_demonstrations(find_root(), **how), sep="\n")
         return
-    asked = [policy for policy in POLICIES.values() if policy.trained] if trained else SHIPPED
-    policies = [POLICIES["truth"], *(p for p in asked if only in p.name and p.name != "truth")]
-    if not any(only in policy.name for policy in asked):
-        names = ", ".join(policy.name for policy in asked)
+    candidates = [policy for policy in POLICIES.values() if policy.trained] if trained else SHIPPED
+    policies = [POLICIES["truth"], *(p for p in candidates if only in p.name and p.name != "truth")]
+    if not any(only in policy.name for policy in candidates):
+        names = ", ".join(policy.name for policy in candidates)
         raise ValueError(f"--only {only!r}: no policy has a name with that; there are {names}")
     print(run(Paths(find_root(), preset), policies=policies, **how))

@@ -63,10 +63,10 @@ def run(paths: Paths, *, workers: int = 0, progress: bool = True) -> Path:
                  for r, state in states.items()}  # fmt: skip
         jobs = {f"{name}-{way}-{r.name}": act_job(files[r], [(pick, find_middle(states[r]))] if pick else [])
                 for r, row in picks.items() for way, pick in row.items()}  # fmt: skip
-        made = run_jobs(jobs, bench.folder / "acts", **how)
-        found = {way: {r.name: judge_grasp(states[r], row[way], read_state(made[f"{name}-{way}-{r.name}"]))
-                       for r, row in picks.items()} for way in WAYS}  # fmt: skip
-        results[name] = {way: summarise_grasps(rows, found["any"]) for way, rows in found.items()}
+        end_files = run_jobs(jobs, bench.folder / "acts", **how)
+        outcomes = {way: {r.name: judge_grasp(states[r], row[way], read_state(end_files[f"{name}-{way}-{r.name}"]))
+                          for r, row in picks.items()} for way in WAYS}  # fmt: skip
+        results[name] = {way: summarise_grasps(rows, outcomes["any"]) for way, rows in outcomes.items()}
     return write_json(paths.results / "grasp.json", results)
 
 
@@ -123,12 +123,12 @@ def judge_surest(results: Results) -> Claim:
     ways = {"surest": "surest", "most probable": "probable", "any": "any"}
     rows = {way: get(results, "grasp", "mmgsd", key) for way, key in ways.items()}
     high = get(results, "grasp", "mmgsd", "surest", "beyond", "high")
-    shown = [f"{way} {say(get(row, 'distance', 'mean'), 'percent')} of the side off, lifted "
+    texts = [f"{way} {say(get(row, 'distance', 'mean'), 'percent')} of the side off, lifted "
              f"{say(get(row, 'lifted', 'mean'), 'percent')}" for way, row in rows.items() if row]  # fmt: skip
     return Claim(
         "surest", "Of the four like corners, a robot should take the one that it is surest of.",
         "One grasp: the surest of the four modes is nearer to a corner than any of them, as far as the 95 % interval "
-        "of the difference tells.", "; ".join(shown) or "–", (None if high is None else high < 0,),
+        "of the difference tells.", "; ".join(texts) or "–", (None if high is None else high < 0,),
         "`.venv/bin/python -m mmgsd run grasp paper`",
     )  # fmt: skip
 

@@ -33,23 +33,23 @@ def run(paths: Paths, *, names: Sequence[str] = OBJECTS) -> Path:
 
 def describe_joint(rows: Mapping[str, Mapping[str, Any]]) -> Table:
     """Shares of right questions and of swaps, a row an object and set, clean ones by image1's state."""
-    lines, known = {}, {name for row in rows.values() for preset in SETS for name in row.get(preset, {}).get("all", {})}
-    heads = {name: head for name, head in HEADS.items() if name in known}
+    lines, names = {}, {name for row in rows.values() for preset in SETS for name in row.get(preset, {}).get("all", {})}
+    heads = {name: head for name, head in HEADS.items() if name in names}
     for row in rows.values():
         for preset, word in SETS.items():
-            for kind, said in row.get(preset, {}).items():
+            for kind, shares in row.get(preset, {}).items():
                 if kind == "all" or preset == next(iter(SETS)):  # states of clean images alone
                     label = f"{row['object']}, {word}" + ("" if kind == "all" else f", {kind}")
-                    lines[label] = [say_value(said, name, 100, ".0f", " %") for name in heads]
+                    lines[label] = [say_value(shares, name, 100, ".0f", " %") for name in heads]
     return make_page_table(list(heads.values()), lines)
 
 
 def make_joint_sentence(rows: Mapping[str, Mapping[str, Any]]) -> str:
     """How many questions were asked, and what a joint answer costs."""
-    asked = sum(row[preset]["all"]["questions"] for row in rows.values() for preset in SETS if preset in row)
+    questions = sum(row[preset]["all"]["questions"] for row in rows.values() for preset in SETS if preset in row)
     cost = max(row["milliseconds"]["joint"] - row["milliseconds"]["alone"] for row in rows.values())
     hardware = next(iter(rows.values()))["hardware"]
-    return f"{asked} questions. A joint answer takes up to {cost} ms more than one that is not ({hardware})."
+    return f"{questions} questions. A joint answer takes up to {cost} ms more than one that is not ({hardware})."
 
 
 STUDY = Study(

@@ -48,8 +48,8 @@ SHOWN = 0.95  # share of a method's errors that the axis of their distribution h
 
 def read_points(preset: str) -> Reader:
     """A reader of material points that a preset asks about."""
-    asked = choose_points(load_preset(preset).evaluate.points, N_POINTS)
-    return listed(among(asked, "the points that the preset asks about"))
+    points = choose_points(load_preset(preset).evaluate.points, N_POINTS)
+    return listed(among(points, "the points that the preset asks about"))
 
 
 def check(paths: Paths, **options: Any) -> None:
@@ -74,9 +74,9 @@ def run(
         there = [m for m in models if m == "mmgsd" or weights[name][m].is_file()]
         tasks |= {(name, m): (name, m, models.get(m)) for m in (*there, *untrained)}
     answers = dict(run_each(partial(_ask, paths=paths, overwrite=overwrite), tasks, desc="methods"))
-    asked = {name: {m: path for (object, m), path in answers.items() if object == name} for name in OBJECTS}
+    query_files = {name: {m: path for (object, m), path in answers.items() if object == name} for name in OBJECTS}
     stored = write_main_table(config, paths.root)
-    for name, files in asked.items():
+    for name, files in query_files.items():
         queries = {m: evaluation.load_queries(path) for m, path in files.items()}
         evaluation.check_same_questions(queries)
         trained = {m: weights[name][m] for m in METHODS if m in files}

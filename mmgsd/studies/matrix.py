@@ -82,8 +82,8 @@ def run_task(
 def _find_start(task: Task, preset: Preset) -> list[TrainConfig]:
     """The models of the preset that a task starts from, if it does: each from the one before it."""
     start = task.trunk_weights if isinstance(task, TrainConfig) else ""
-    found = [model for model in list_runs(preset, STUDIES) if model.name == start]
-    return [*_find_start(found[0], preset), *found] if found else []
+    starts = [model for model in list_runs(preset, STUDIES) if model.name == start]
+    return [*_find_start(starts[0], preset), *starts] if starts else []
 
 
 def run_tasks(tasks: list[Task], preset: Preset, root: Path, *, scheduler: str = "") -> Iterator[tuple]:
@@ -234,8 +234,8 @@ def write_study_table(
     named = _list_named(paths) if study == "seeds" else {}
     for name in OBJECTS:
         for key, model in configure_study(preset, name, study, varied, steps=steps).items():
-            kept = get(stored, name, key) or named.get(model.name, {})
-            row, run = _find_row(paths, "", model, kept, kept.get("run", {}))
+            stored_row = get(stored, name, key) or named.get(model.name, {})
+            row, run = _find_row(paths, "", model, stored_row, stored_row.get("run", {}))
             if row:
                 rows.setdefault(name, {})[key] = {**row, "run": run}
     if rows or stored:
@@ -311,13 +311,13 @@ def main(
                          f"got --seeds {seeds}, --steps {steps}, --study {study!r}")  # fmt: skip
     if study and seeds:
         raise ValueError(f"--study and --seeds are two different lists of models: give one, got {study!r} and {seeds}")
-    given = load_preset(preset)
-    tasks = [task for task in choose_tasks(given, study=study, seeds=seeds, steps=steps) if only in name_task(task)]
+    config = load_preset(preset)
+    tasks = [task for task in choose_tasks(config, study=study, seeds=seeds, steps=steps) if only in name_task(task)]
     if missing:
         if not seeds:
             raise ValueError("--missing must be given with --seeds")
-        tasks = drop_done(tasks, Paths(find_root(), given.name), f"seeds_{steps}.json" if steps else "seeds.json")
+        tasks = drop_done(tasks, Paths(find_root(), config.name), f"seeds_{steps}.json" if steps else "seeds.json")
     elif not tasks:
-        raise ValueError(f"--only {only!r}: no model or baseline of the preset {given.name} has a name with that")
-    asked = {"study": study, "seeds": seeds, "steps": steps}
-    run_matrix(Paths(find_root(), given.name), tasks, **asked, scheduler=read_scheduler("--scheduler", scheduler))
+        raise ValueError(f"--only {only!r}: no model or baseline of the preset {config.name} has a name with that")
+    options = {"study": study, "seeds": seeds, "steps": steps}
+    run_matrix(Paths(find_root(), config.name), tasks, **options, scheduler=read_scheduler("--scheduler", scheduler))

@@ -70,8 +70,8 @@ class Model:
     @property
     def difference(self) -> str:
         """What it differs in from what it starts from, in words."""
-        said = {name: value.text if isinstance(value, Rule) else value for name, value in self.changes.items()}
-        return ", ".join(f"{name} {value}" for name, value in {**said, **self.scene}.items())
+        changes = {name: value.text if isinstance(value, Rule) else value for name, value in self.changes.items()}
+        return ", ".join(f"{name} {value}" for name, value in {**changes, **self.scene}.items())
 
 
 # In "budget" are the models of "main" with equally many steps, which are then the smaller budget's. With the
@@ -190,9 +190,9 @@ def configure_study(
     models = {row.name: _configure(base, row) for row in rows if object in row.objects}
     models = {name: dataclasses.replace(model, also=preset.cluttered) if model.also else model
               for name, model in models.items()}  # fmt: skip
-    kept = [row.name for row in rows
-            if row.name in models and (row.scene or models[row.name] != models.get(row.start))]  # fmt: skip
-    return {name: dataclasses.replace(models[name], steps=steps or models[name].steps) for name in kept}
+    names = [row.name for row in rows
+             if row.name in models and (row.scene or models[row.name] != models.get(row.start))]  # fmt: skip
+    return {name: dataclasses.replace(models[name], steps=steps or models[name].steps) for name in names}
 
 
 def _configure(base: TrainConfig, row: Model) -> TrainConfig:
@@ -207,15 +207,15 @@ def list_runs(preset: Preset, studies: Sequence[str] = RUN) -> list[TrainConfig]
 
     Those of the main table that need images of another preset besides are run in their own study alone.
     """
-    found = []
+    all_runs = []
     for study in studies:
         models = {name: configure_study(preset, name, study) for name in OBJECTS}
         names = dict.fromkeys(name for keyed in models.values() for name in keyed)
         late = [n for n in names if study == "main" and "budget" not in ROWS[n].studies]
         ordered = [*(n for n in names if n not in late), *late]
         runs = [models[o][n] for n in ordered for o in OBJECTS if n in models[o]]
-        found += [model for model in runs if study != "main" or not model.also]
-    return list(dict.fromkeys(found))
+        all_runs += [model for model in runs if study != "main" or not model.also]
+    return list(dict.fromkeys(all_runs))
 
 
 def get_label(name: str, *, short: bool = False) -> str:

@@ -32,8 +32,8 @@ def configure(paths: Paths, name: str, start: str) -> tuple[RenderConfig, TrainC
     preset = load_preset(paths.preset)
     scene, cloth = dataclasses.replace(preset.render["cloth"], object=name), preset.train["cloth"]
     # The roles are the shipped network's; the group comes with the data set.
-    told = {"object": name, "group": "", "roles": 2, "trunk_weights": start, "steps": 2 * cloth.steps}
-    model = dataclasses.replace(cloth, **told)
+    changes = {"object": name, "group": "", "roles": 2, "trunk_weights": start, "steps": 2 * cloth.steps}
+    model = dataclasses.replace(cloth, **changes)
     check_start(model, paths.generated / "models")
     return scene, model
 
@@ -53,9 +53,9 @@ def measure(weights: Path, images: Path, paths: Paths, name: str, **how: Any) ->
     table = evaluate_model(weights, images, load_preset(paths.preset).evaluate, queries, **how)
     file = paths.results / RESULTS
     write_json(file, read_results(file) | {name: summarise({"mmgsd": table})["mmgsd"]})
-    shown = find_shown(paths, name)
-    found = read_results(shown.results / RESULTS)[name]
-    return pd.Series(found, name=f"{name}, {shown.preset}")[SHOWN].round(2).to_frame()
+    source = find_shown(paths, name)
+    errors = read_results(source.results / RESULTS)[name]
+    return pd.Series(errors, name=f"{name}, {source.preset}")[SHOWN].round(2).to_frame()
 
 
 def find_shown(paths: Paths, name: str) -> Paths:

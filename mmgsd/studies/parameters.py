@@ -46,9 +46,9 @@ def open_paths(preset: str) -> Paths:
     return Paths(find_root(), preset)
 
 
-def check_made(paths: Paths, by: str, files: Iterable[Path], **told: str) -> None:
-    """ValueError where one of ``files`` is not there; ``by`` makes it, for the preset and what else is ``told``."""
-    same = ", ".join(f"{name}={value!r}" for name, value in {"preset": paths.preset, **told}.items())
+def check_made(paths: Paths, by: str, files: Iterable[Path], **options: str) -> None:
+    """ValueError where one of ``files`` is not there; ``by`` makes it, for the preset and the other ``options``."""
+    same = ", ".join(f"{name}={value!r}" for name, value in {"preset": paths.preset, **options}.items())
     for file in files:
         if not file.exists():
             place = file.relative_to(paths.root) if file.is_relative_to(paths.root) else file
@@ -92,27 +92,27 @@ read_method = one_of([row.name for row in list_rows("main")])  # the main table 
 def among(values: Collection[int], whose: str) -> Reader:
     """A reader of one of some whole numbers, ``whose`` says which these are."""
     first = ", ".join(map(str, sorted(values)[:3]))
-    return _numbers(f"one of {whose} ({first}, … {max(values)})", lambda found: found in values, int)
+    return _numbers(f"one of {whose} ({first}, … {max(values)})", lambda value: value in values, int)
 
 
 def whole(least: int = 0, most: float = math.inf) -> Reader:
     """A reader of whole numbers from ``least`` on, up to and with ``most`` if given."""
     accepted = f"a whole number {_describe_range(least, most)}"
-    return _numbers(accepted, lambda found: found == int(found) and least <= found <= most, int)
+    return _numbers(accepted, lambda value: value == int(value) and least <= value <= most, int)
 
 
 def number(*, above: float | None = None, least: float = -math.inf, most: float = math.inf) -> Reader:
     """A reader of finite numbers ``above`` one, or from ``least`` to ``most``."""
     accepted = f"a number {_describe_range(least, most)}" if above is None else f"a number greater than {above:g}"
-    return _numbers(accepted, lambda found: least <= found <= most and (above is None or found > above), float)
+    return _numbers(accepted, lambda value: least <= value <= most and (above is None or value > above), float)
 
 
 def _numbers(accepted: str, fits: Callable[[float], bool], kind: type) -> Reader:
     def read(name: str, value: Any) -> Any:
         """The number, of the kind that is asked for."""
-        found = _to_number(value)
-        check(name, value, accepted, found is not None and fits(found))
-        return kind(found)
+        parsed = _to_number(value)
+        check(name, value, accepted, parsed is not None and fits(parsed))
+        return kind(parsed)
 
     return read
 
@@ -174,10 +174,10 @@ def read_weights(name: str, value: Any) -> str:
     if value in shipped:
         return value
     try:
-        found = read_file(name, value)
+        file = read_file(name, value)
     except ValueError as error:
         raise ValueError(f"{error}; or {describe_choices(value, shipped)}") from error
-    return str(value) if Path(value).is_file() else str(found)  # a model's name depends on how its start was written
+    return str(value) if Path(value).is_file() else str(file)  # a model's name depends on how its start was written
 
 
 def read_object(name: str, value: Any) -> str:
@@ -193,8 +193,8 @@ def read_file(name: str, value: Any) -> Path:
     """
     if not isinstance(value, str | Path) or not str(value).strip():
         raise ValueError(f"{name} must be the path of a file, got {value!r}")
-    given = Path(value).expanduser()
-    places = dict.fromkeys(place / given for place in (Path.cwd(), find_root()))  # an absolute path stays as it is
+    path = Path(value).expanduser()
+    places = dict.fromkeys(place / path for place in (Path.cwd(), find_root()))  # an absolute path stays as it is
     for place in places:
         if place.is_file():
             return place
@@ -202,8 +202,8 @@ def read_file(name: str, value: Any) -> Path:
     raise ValueError(f"{name} must be the path of a file that exists, got {str(value)!r}: there is no file {looked}")
 
 
-def _list_assigned(cell: str, known: Mapping[str, Any]) -> list[str]:
-    """The names that a cell of parameters assigns: one that papermill wrote, or assigns known names and only values."""
+def _list_assigned(cell: str, parameters: Mapping[str, Any]) -> list[str]:
+    """The names that a cell assigns: one that papermill wrote, or assigns some of ``parameters`` and only values."""
     try:
         statements = ast.parse(cell).body
     except SyntaxError:
@@ -211,7 +211,7 @@ def _list_assigned(cell: str, known: Mapping[str, Any]) -> list[str]:
     if not all(isinstance(s, ast.Assign) and isinstance(s.targets[0], ast.Name) for s in statements):
         return []
     names = [statement.targets[0].id for statement in statements]
-    return names if cell.startswith(INJECTED) or set(names) & set(known) else []
+    return names if cell.startswith(INJECTED) or set(names) & set(parameters) else []
 
 
 def _describe_range(least: float, most: float) -> str:
@@ -223,10 +223,10 @@ def _to_number(value: Any) -> float | None:
     if isinstance(value, bool) or not isinstance(value, numbers.Real | str):
         return None
     try:
-        found = float(value)
+        result = float(value)
     except (ValueError, OverflowError):
         return None
-    return found if math.isfinite(found) else None
+    return result if math.isfinite(result) else None
 
 
 def _to_list(value: Any) -> list | None:

@@ -22,7 +22,7 @@ ENDS = 0.1  # of a rope's length at each end, its extremities; the middle is the
 COMMAND = "`04_evaluate`, `07_figures`"
 
 
-def measure_all(folder: Path, found: Results | None = None) -> dict[str, Any]:
+def measure_all(folder: Path, results: Results | None = None) -> dict[str, Any]:
     """``places``, ``peaks`` {object: `measure_places`, `count_peaks`} of a preset's data of figures, where it is."""
     drawn = {name: load_figure_data(path) for name, path in main.list_drawn(folder).items() if path.is_file()}
     places = {name: measure_places(data, name) for name, data in drawn.items()}
@@ -40,8 +40,8 @@ def measure_places(data: FigureData, name: str) -> dict[str, float]:
     errors, from_middle = data.errors["mmgsd"], np.abs(np.arange(N_POINTS) / (N_POINTS - 1) - 0.5)
     along = {"end": from_middle > 0.5 - ENDS, "middle": from_middle < ENDS}
     places = find_regions() if name == "cloth" else along
-    mean, asked = np.nan_to_num(errors.mean_px), errors.asked
-    return {place: float(np.average(mean[p], weights=asked[p])) for place, p in places.items() if asked[p].any()}
+    mean, counts = np.nan_to_num(errors.mean_px), errors.asked
+    return {place: float(np.average(mean[p], weights=counts[p])) for place, p in places.items() if counts[p].any()}
 
 
 def describe_places(results: Results) -> Table:

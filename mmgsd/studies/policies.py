@@ -103,8 +103,8 @@ def ask(policy: Policy, object: str, look: Look, image: np.ndarray, mask: np.nda
     As many modes as the symmetry has members are asked for, also of methods that learnt one match a pixel.
     """
     matcher, order = load_matcher(policy, object), load_group(object, DEFAULT_GROUP[object]).order
-    told = {"mask1": mask} if isinstance(matcher, BaselineMatcher) else {"joint": policy.chosen == JOINT}
-    return match_look(matcher, look, image, by_name=policy.named, n=1 if policy.one else order, **told)
+    options = {"mask1": mask} if isinstance(matcher, BaselineMatcher) else {"joint": policy.chosen == JOINT}
+    return match_look(matcher, look, image, by_name=policy.named, n=1 if policy.one else order, **options)
 
 
 def draw_moves(look: Look, mask: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -119,9 +119,9 @@ def _fold(paths: Paths, object: str, limit: int, count: int) -> None:
                for key, model in models.items()}  # fmt: skip
     policies = [Policy(f"{key}-{limit}", "", "", chosen=AGREE, weights=path) for key, path in weights.items()]
     bench = Bench(place / "folding", {"progress": True})
-    found = measure_success(bench, policies, list_limited(object, count, limit))
+    shares = measure_success(bench, policies, list_limited(object, count, limit))
     for key in models:
-        rows[key]["folds"] = found[f"{key}-{limit}"] | {"rollouts": count}
+        rows[key]["folds"] = shares[f"{key}-{limit}"] | {"rollouts": count}
     write_results(results, file)
 
 
@@ -129,9 +129,9 @@ def _list_objects(objects: str | Sequence[str]) -> list[str]:
     return [objects] if isinstance(objects, str) else list(objects)
 
 
-def get_rows(results: Results, object: str, limit: int, asked: str = "within") -> dict[str, Any]:
-    """{"mmgsd-0": errors} of the models trained within a limit, asked about poses ``within`` it or about ``any``."""
-    return {key: row[asked] for key, row in (get(results, object, str(limit)) or {}).items()}
+def get_rows(results: Results, object: str, limit: int, poses: str = "within") -> dict[str, Any]:
+    """{"mmgsd-0": errors} of the models trained within a limit, asked about ``poses`` "within" it or about "any"."""
+    return {key: row[poses] for key, row in (get(results, object, str(limit)) or {}).items()}
 
 
 def describe_limits(results: Results) -> Table:
@@ -160,10 +160,10 @@ def describe_limits(results: Results) -> Table:
 def _describe_row(results: Results, object: str, limit: int, method: str) -> dict[str, Any]:
     within = get_rows(results, object, limit)
     every = None if limit == LIMITS_DEG[-1] else _mean(get_rows(results, object, limit, "any"), method)
-    found = _mean(within, method, "pck@20px")
+    pck = _mean(within, method, "pck@20px")
     folds = get(results, object, str(limit), f"{method}-0", "folds")
-    told = folds and folds["count"] and f"{100 * folds['mean']:.0f} % of {folds['count']}"
-    return {"rmse": say_seeds(within, method), "found": found, "folds": told, "any": every}
+    success = folds and folds["count"] and f"{100 * folds['mean']:.0f} % of {folds['count']}"
+    return {"rmse": say_seeds(within, method), "found": pck, "folds": success, "any": every}
 
 
 def _mean(rows: Mapping[str, Results], method: str, measure: str = "rmse_mean") -> float | None:
@@ -188,9 +188,9 @@ def plot_limits(results: Results) -> Figure | None:
     for axis, name in zip(axes[0], there, strict=True):
         for method in METHODS:
             errors = [list_seeds(get_rows(results, name, limit), method) for limit in LIMITS_DEG]
-            known = [k for k in places if errors[k]]
-            axis.plot(known, [statistics.mean(errors[k]) for k in known], **get_line_style(method))
-            axis.scatter([k for k in known for _ in errors[k]], [e for k in known for e in errors[k]], s=8,
+            measured = [k for k in places if errors[k]]
+            axis.plot(measured, [statistics.mean(errors[k]) for k in measured], **get_line_style(method))
+            axis.scatter([k for k in measured for _ in errors[k]], [e for k in measured for e in errors[k]], s=8,
                          color=get_colour(method), linewidths=0)  # fmt: skip
         axis.set_xticks(list(places), [say_limit(limit) for limit in LIMITS_DEG])
         axis.set(title=name, xlabel="poses trained and asked", ylabel="RMSE (px)", ylim=(0, None))
@@ -198,10 +198,10 @@ def plot_limits(results: Results) -> Figure | None:
     return finish_axes(figure)
 
 
-def find_results(folder: Path, found: Results) -> dict[str, Any]:
+def find_results(folder: Path, results: Results) -> dict[str, Any]:
     """A preset without results of its own has those of quick: the study is of that size."""
     file = folder.with_name("quick") / "pose_range.json"
-    return {} if found or not file.is_file() else {"pose_range": read_table(file)}
+    return {} if results or not file.is_file() else {"pose_range": read_table(file)}
 
 
 def draw(folder: Path) -> Figure | None:
@@ -211,19 +211,19 @@ def draw(folder: Path) -> Figure | None:
 
 def judge_one_match(results: Results) -> Claim:
     """This project's own conjecture: what the mixture is needed for."""
-    rows, parts, shown = results.get("pose_range", {}), [], []
+    rows, parts, texts = results.get("pose_range", {}), [], []
     for name in OBJECTS:
         gaps = {limit: _compute_gap(rows, name, limit) for limit in LIMITS_DEG}
         narrow, wide = [gaps[limit] for limit in NARROW], gaps[LIMITS_DEG[-1]]
-        known = None not in (*narrow, wide)
-        parts.append(min(narrow) > max(MARGIN, wide) if known else None)
-        shown.append(f"{name} {', '.join(f'{say_limit(k)} {_say_gap(gap)}' for k, gap in gaps.items())}")
+        complete = None not in (*narrow, wide)
+        parts.append(min(narrow) > max(MARGIN, wide) if complete else None)
+        texts.append(f"{name} {', '.join(f'{say_limit(k)} {_say_gap(gap)}' for k, gap in gaps.items())}")
     return Claim(
         "one-match",
         "Our conjecture: one match teaches as much as all where poses are uniform, and less where they are limited.",
         f"Within {' and '.join(map(say_limit, NARROW))} Unimodal's error is above MMGSD's by more than "
         f"{100 * MARGIN:.0f} %, and by more than at any pose; means over seeds, a part each object.",
-        f"Unimodal above MMGSD by: {'; '.join(shown)}", tuple(parts), "`.venv/bin/python -m mmgsd run pose_range`",
+        f"Unimodal above MMGSD by: {'; '.join(texts)}", tuple(parts), "`.venv/bin/python -m mmgsd run pose_range`",
     )  # fmt: skip
 
 
@@ -240,10 +240,10 @@ def _say_gap(gap: float | None) -> str:
 def count_findings(results: Results) -> dict[str, str]:
     """By how much Unimodal's error is above MMGSD's within the wider of the narrow limits."""
     gaps = {name: _compute_gap(results.get("pose_range", {}), name, NARROW[-1]) for name in OBJECTS}
-    told = " and ".join(f"{100 * gap:.0f} % ({name})" for name, gap in gaps.items() if gap is not None)
+    text = " and ".join(f"{100 * gap:.0f} % ({name})" for name, gap in gaps.items() if gap is not None)
     fewest = min((len(list_seeds(get_rows(results["pose_range"], name, NARROW[-1]), "unimodal"))
                   for name, gap in gaps.items() if gap is not None), default=0)  # fmt: skip
-    return {"narrow": told or "by an unknown share", "seeds": ", one seed" if fewest == 1 else ""}
+    return {"narrow": text or "by an unknown share", "seeds": ", one seed" if fewest == 1 else ""}
 
 
 STUDY = Study(

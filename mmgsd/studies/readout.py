@@ -82,7 +82,7 @@ def measure_ways(
     matcher: Matcher, data: Dataset, *, config: EvaluateConfig = QUESTIONS, ways: Mapping[str, Way] = WAYS
 ) -> dict[str, dict[str, float]]:
     """{way: its errors} over the queries with a visible source of every second pair."""
-    found, before, shrinkage = {}, matcher.temperature, matcher.shrinkage
+    errors, before, shrinkage = {}, matcher.temperature, matcher.shrinkage
     images = _describe_all(matcher, data, config)
     for name, way in ProgressBar(ways.items(), desc=f"ways of {matcher.config.object}", total=len(ways)):
         scales = [before * factor for factor in TEMPERATURES] if way.temperature == 0 else [way.temperature or before]
@@ -92,10 +92,10 @@ def measure_ways(
             table = ask(_make_answer(matcher, data, config, way, images), data, config, matcher.config.group, False, "")
             tables[scale] = table[table.visible]
         best = min(tables, key=lambda scale: tables[scale].rmse_px[tables[scale].pair % 2 == 1].mean())
-        kept = tables[best][tables[best].pair % 2 == 0]
-        found[name] = {**aggregate(kept), "temperature": best}
+        queries = tables[best][tables[best].pair % 2 == 0]
+        errors[name] = {**aggregate(queries), "temperature": best}
     matcher.temperature, matcher.shrinkage = before, shrinkage
-    return found
+    return errors
 
 
 def _describe_all(matcher: Matcher, data: Dataset, config: EvaluateConfig) -> dict[tuple[int, bool], list[Outputs]]:

@@ -106,9 +106,9 @@ class Study:
     def load(self, folder: Path) -> dict[str, Any]:
         """{name: content} of its results files that are there, and what it derives from them."""
         files = {name: folder / f"{name}.json" for name in self.results}
-        found = {name: read_table(path) for name, path in files.items() if path.is_file()}
+        results = {name: read_table(path) for name, path in files.items() if path.is_file()}
         with told_where(next(iter(files.values()), folder)):
-            return found | (self.derive(folder, found) if self.derive else {})
+            return results | (self.derive(folder, results) if self.derive else {})
 
 
 @dataclass(frozen=True)
@@ -144,10 +144,10 @@ class Experiment:
         """A table or a sentence of the study from the preset's results, as a notebook displays it."""
         from IPython.display import Markdown
 
-        shown = self.study.tables[name]
-        file = Path(shown.file)
+        table = self.study.tables[name]
+        file = Path(table.file)
         results = self.read(file.stem) if file.suffix else load_results(self.paths.results)
-        return Markdown(to_markdown(shown.make(results)))
+        return Markdown(to_markdown(table.make(results)))
 
     def show_file(self, path: Path) -> Any:
         """A stored figure, as a notebook displays it."""
@@ -181,13 +181,13 @@ def open_study(name: str, preset: str, *, run: bool = False, **options: Any) -> 
     ValueError, which says what to run first, where what it needs for that is not there.
     """
     study, paths = get_study(name), Paths(find_root(), preset)
-    shown = study.list_shown(paths, **options)
+    files = study.list_shown(paths, **options)
     if run:
         study.check(paths, **options)
     else:
         by = f"{study.notebook} with run=True" if study.notebook else "python -m mmgsd run " + name
-        check_made(paths, by, shown)
-    return Experiment(study, paths, run, options, shown)
+        check_made(paths, by, files)
+    return Experiment(study, paths, run, options, files)
 
 
 def save_figures(figures: Mapping[str, Figure | None], folder: Path) -> pd.DataFrame:

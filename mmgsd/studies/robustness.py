@@ -117,12 +117,12 @@ def plot_robustness(rows: Rows) -> Figure:
     figure, axes = plt.subplots(1, len(PANELS), figsize=size, layout="constrained", sharey=True)
     for axis, (title, part, key, scale, unit) in zip(axes, PANELS, strict=True):
         for place, name in zip(places, names, strict=True):
-            found = get_photographs(rows, name) if part == "photographs" else rows[name].get(part, {})
-            value, named = found.get(key), found.get("by_name", {}).get(key)
-            interval = [scale * bound for bound in (found.get("intervals") or {}).get(key) or ()]
+            measures = get_photographs(rows, name) if part == "photographs" else rows[name].get(part, {})
+            value, named = measures.get(key), measures.get("by_name", {}).get(key)
+            interval = [scale * bound for bound in (measures.get("intervals") or {}).get(key) or ()]
             _draw_bar(axis, place, name, value and scale * value, named and scale * named, interval)
-            if value and found.get("unanswered"):
-                axis.texts[-1].set_text(f"{axis.texts[-1].get_text()}; {100 * found['unanswered']:.0f} not answered")
+            if value and measures.get("unanswered"):
+                axis.texts[-1].set_text(f"{axis.texts[-1].get_text()}; {100 * measures['unanswered']:.0f} not answered")
         axis.set(title=title, xlabel=unit)
     widest = 1.12 * max(1.0, *(axis.dataLim.x1 for axis in axes[:2]))
     for axis, most in zip(axes, (widest, widest, 250), strict=True):  # %, with room for the words

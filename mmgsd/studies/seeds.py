@@ -40,8 +40,8 @@ Tested = Mapping[tuple[Any, str], tuple[float, float]]  # as `compare_seeds` has
 
 def say_tested(results: Mapping[Any, Results], tested: Tested, name: Any, method: str) -> str | None:
     """`say_seeds` of one part of the results, with an asterisk where p < `LEVEL`, a dagger where only without Holm."""
-    said, (alone, corrected) = say_seeds(results.get(name, {}), method), tested.get((name, method), (1.0, 1.0))
-    return f"{said}{' *' if corrected < LEVEL else ' †' if alone < LEVEL else ''}" if said else None
+    text, (alone, corrected) = say_seeds(results.get(name, {}), method), tested.get((name, method), (1.0, 1.0))
+    return f"{text}{' *' if corrected < LEVEL else ' †' if alone < LEVEL else ''}" if text else None
 
 
 def compare_seeds(results: Mapping[Any, Results], others: Mapping[str, str] | None = None) -> Tested:
@@ -66,9 +66,9 @@ def compare_seeds(results: Mapping[Any, Results], others: Mapping[str, str] | No
 def make_first_seed_sentence(results: Results) -> str:
     """What the seed 0 of MMGSD, which other studies rest on, has beside its other seeds."""
     each = {name: list_seeds(results[name], "mmgsd") for name in OBJECTS}
-    said = [f"{values[0]:.1f} px on {name} (others {', '.join(f'{v:.1f}' for v in values[1:])})"
-            for name, values in each.items()]  # fmt: skip
-    return f"The tables of budget, σ and symmetry rest on MMGSD's seed 0: {', '.join(said)}."
+    texts = [f"{values[0]:.1f} px on {name} (others {', '.join(f'{v:.1f}' for v in values[1:])})"
+             for name, values in each.items()]  # fmt: skip
+    return f"The tables of budget, σ and symmetry rest on MMGSD's seed 0: {', '.join(texts)}."
 
 
 def say_seeds(rows: Results, method: str) -> str | None:
@@ -103,12 +103,12 @@ def count_findings(results: Results) -> dict[str, str]:
     """On which objects seeds tell SPCL from MMGSD, and SPCL with dense supervision, corrected for all compared."""
     tested = compare_seeds(results["seeds_1000"])
 
-    def say_apart(method: str) -> str:
+    def name_objects(method: str) -> str:
         """On which of the objects tests tell a method from MMGSD."""
-        found = [name for name in OBJECTS if tested.get((name, method), (1.0, 1.0))[1] < LEVEL]
-        return {0: "on neither", len(OBJECTS): "on both"}.get(len(found), f"on the {' and '.join(found)} alone")
+        names = [name for name in OBJECTS if tested.get((name, method), (1.0, 1.0))[1] < LEVEL]
+        return {0: "on neither", len(OBJECTS): "on both"}.get(len(names), f"on the {' and '.join(names)} alone")
 
-    return {"apart": say_apart("spcl"), "apart_dense": say_apart("spcl_dense")}
+    return {"apart": name_objects("spcl"), "apart_dense": name_objects("spcl_dense")}
 
 
 STUDY = Study(

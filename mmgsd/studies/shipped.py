@@ -53,7 +53,7 @@ ROUND_HEADS = ("steps so far", "clean: RMSE px", "cluttered", "averaged with all
 def list_names(rows: Rows, object: str) -> list[str]:
     """The rows of an object: weights for everything, those of the paper's images, then baselines; all read alike."""
     order = [object, f"{object}-paper", *(f"{object}-{name}" for name in (*BASELINES, *OPTIONAL))]
-    return [found for name in order if (found := find_alike(rows, name)) in rows]
+    return [alike for name in order if (alike := find_alike(rows, name)) in rows]
 
 
 def find_alike(rows: Rows, name: str) -> str:
@@ -74,8 +74,8 @@ def label_row(name: str) -> str:
 
 def get_photographs(rows: Rows, name: str) -> Mapping[str, Any]:
     """What a row found in photographs; nothing where it counted other marks than the object's shipped weights did."""
-    found, like = (rows.get(key, {}).get("photographs", {}) for key in (name, name.partition("@")[0].partition("-")[0]))
-    return found if found.get("marks") == like.get("marks") else {}
+    own, like = (rows.get(key, {}).get("photographs", {}) for key in (name, name.partition("@")[0].partition("-")[0]))
+    return own if own.get("marks") == like.get("marks") else {}
 
 
 def describe_limits(rows: Rows) -> Table:
@@ -123,9 +123,9 @@ def describe_pictures(rows: Rows, labels: Mapping[str, str] | None = None) -> Ta
     """Errors on clean and cluttered renders and what is found in photographs, a row a model, or one of ``labels``."""
     if labels is None:
         labels = {name: label_row(name) for object in OBJECTS for name in list_names(rows, object)}
-    found = "photographs: found", "spurious", "not answered", "best of the rest"
-    found = found if any(get_photographs(rows, name) for name in labels) else ()
-    heads, lines = [*(f"{word}: RMSE px" for word in SETS.values()), *found], {}
+    columns = "photographs: found", "spurious", "not answered", "best of the rest"
+    columns = columns if any(get_photographs(rows, name) for name in labels) else ()
+    heads, lines = [*(f"{word}: RMSE px" for word in SETS.values()), *columns], {}
     for name, label in labels.items():
         photographs = get_photographs(rows, name)
         cells = [say_value(rows[name].get(preset), "rmse_mean", 1, ".1f") for preset in SETS]
@@ -137,9 +137,9 @@ def describe_pictures(rows: Rows, labels: Mapping[str, str] | None = None) -> Ta
     return make_page_table(heads, lines)
 
 
-def _tell_photographs(found: Mapping[str, Any]) -> list[str]:
-    shares = [_say_interval(found, key) for key in ("found@5%", "spurious")]
-    return [*shares, say_value(found, "unanswered", 100, ".0f", " %"), say_value(found, "best", 1, ".1f", " %")]
+def _tell_photographs(measures: Mapping[str, Any]) -> list[str]:
+    shares = [_say_interval(measures, key) for key in ("found@5%", "spurious")]
+    return [*shares, say_value(measures, "unanswered", 100, ".0f", " %"), say_value(measures, "best", 1, ".1f", " %")]
 
 
 def _say_interval(photographs: Mapping[str, Any], key: str) -> str:
@@ -151,28 +151,28 @@ def _say_interval(photographs: Mapping[str, Any], key: str) -> str:
 
 def make_reading_sentence(rows: Rows) -> str:
     """How all of `describe_pictures` are read, and whether intervals of what two weights find overlap."""
-    said = [f"power {rows[object]['power']:g}, sharpness {rows[object]['sharpness']:g} ({object})"
-            for object in OBJECTS]  # fmt: skip
-    apart = [f"those of `{object}` and `{object}-paper` {_tell_apart(rows, object)}" for object in OBJECTS]
+    readouts = [f"power {rows[object]['power']:g}, sharpness {rows[object]['sharpness']:g} ({object})"
+                for object in OBJECTS]  # fmt: skip
+    comparisons = [f"those of `{object}` and `{object}-paper` {_compare_intervals(rows, object)}" for object in OBJECTS]
     shares = [f"{rows[object]['shrinkage']:g} ({object})" for object in OBJECTS if rows[object].get("shrinkage")]
     shrunk = f"; the shipped weights shrink sources by {' and '.join(shares)}" if shares else ""
     plain = [text for object in OBJECTS if (text := _tell_unshrunk(rows, object))]
     beside = f" (without that {', '.join(plain)})" if plain else ""
-    return (f"In this table all are read with {' or '.join(said)}{shrunk}{beside}. 95 % intervals by photographs: "
-            f"{', '.join(apart)}.")  # fmt: skip
+    return (f"In this table all are read with {' or '.join(readouts)}{shrunk}{beside}. 95 % intervals by photographs: "
+            f"{', '.join(comparisons)}.")  # fmt: skip
 
 
 def _tell_unshrunk(rows: Rows, object: str) -> str:
     """What shipped weights find, read as the others are that know no shrinkage; "" where that was not measured."""
     readout = ",".join(f"{rows[object][key]:g}" for key in READING)
-    found = get_photographs(rows, f"{object}@{readout},0")
-    share, spurious = (say_value(found, key, 100, ".0f", " %") for key in ("found@5%", "spurious"))
-    return f"`{object}` finds {share} with {spurious} spurious" if found else ""
+    photographs = get_photographs(rows, f"{object}@{readout},0")
+    share, spurious = (say_value(photographs, key, 100, ".0f", " %") for key in ("found@5%", "spurious"))
+    return f"`{object}` finds {share} with {spurious} spurious" if photographs else ""
 
 
-def _tell_apart(rows: Rows, object: str) -> str:
-    found = [get_photographs(rows, name) for name in (object, find_alike(rows, f"{object}-paper"))]
-    intervals = [(photographs.get("intervals") or {}).get("found@5%") for photographs in found]
+def _compare_intervals(rows: Rows, object: str) -> str:
+    both = [get_photographs(rows, name) for name in (object, find_alike(rows, f"{object}-paper"))]
+    intervals = [(photographs.get("intervals") or {}).get("found@5%") for photographs in both]
     if None in intervals:
         return "are not compared"
     (low, high), (other_low, other_high) = intervals
@@ -182,9 +182,9 @@ def _tell_apart(rows: Rows, object: str) -> str:
 def describe_cloth_renders(rows: Rows) -> Table:
     """The errors on others' renders of a cloth, a row the weights, and what the paper says of its own."""
     names = [find_alike(rows, f"cloth{kind}") for kind in SHIPPED.values()]
-    found = {label_row(name): {"": row} for name in names if (row := rows.get(name, {}).get("cloth_renders"))}
+    ours = {label_row(name): {"": row} for name in names if (row := rows.get(name, {}).get("cloth_renders"))}
     theirs = {"*the paper's MMGSD, on images like its training's*": {"": {"rmse_mean": PAPER["cloth"]}}}
-    return Table(" ", {"": [dataclasses.replace(column, optional=True) for column in ERRORS]}, found, quoted=theirs)
+    return Table(" ", {"": [dataclasses.replace(column, optional=True) for column in ERRORS]}, ours, quoted=theirs)
 
 
 def describe_readings(rows: Rows) -> Table:
@@ -213,9 +213,9 @@ def describe_knowledge(rows: Rows) -> Table:
     lines = {}
     for name in (name for object in OBJECTS for name in (object, f"{object}-paper")):
         for preset, word in SETS.items() if "calibrated" in rows.get(name, {}) else ():
-            found = rows[name].get(preset, {})
-            found = {**found, **found.get("heads", {}), **found.get("asked", {})}
-            lines[f"`{name}`, {word}"] = [say_value(found, key, 1, FORMS.get(key, ".2f"))
+            values = rows[name].get(preset, {})
+            values = {**values, **values.get("heads", {}), **values.get("asked", {})}
+            lines[f"`{name}`, {word}"] = [say_value(values, key, 1, FORMS.get(key, ".2f"))
                                           for key in measures.values()]  # fmt: skip
     return make_page_table(list(measures), lines)
 
@@ -232,7 +232,7 @@ def describe_rounds(rounds: Rows) -> Table:
                 f"{steps}",
                 *(say_value(unseen.get(which), word, 1, ".1f") for which in ("alone", "averaged")
                   for word in SETS.values()),
-                *(say_value(found, key, 100, ".0f", " %") for found in (photographs, photographs.get("by_name"))
+                *(say_value(shares, key, 100, ".0f", " %") for shares in (photographs, photographs.get("by_name"))
                   for key in ("found@5%", "spurious")),
             ]  # fmt: skip
     return make_page_table(ROUND_HEADS, lines)
@@ -243,9 +243,9 @@ def describe_sources(rows: Rows) -> Table:
     lines = {}
     shares = ("unanswered", "found@5%", "found@10%", "spurious")
     for object in OBJECTS:
-        for name, said in rows[object]["photographs"]["sources"].items():
-            asked, best = say_value(said, "queries", 1, "d"), say_value(said, "best", 1, ".1f", " %")
-            lines[f"{object}, `{name}`"] = [asked, *(say_value(said, key, 100, ".0f", " %") for key in shares), best]
+        for name, source in rows[object]["photographs"]["sources"].items():
+            count, best = say_value(source, "queries", 1, "d"), say_value(source, "best", 1, ".1f", " %")
+            lines[f"{object}, `{name}`"] = [count, *(say_value(source, key, 100, ".0f", " %") for key in shares), best]
     return make_page_table(["questions", "unanswered", "found", "at 10 %", "spurious", "best"], lines)
 
 
@@ -276,8 +276,8 @@ def measure_study(
     files = {key: paths.model(model) / WEIGHTS for key, model in models.items()}
     missing = [str(file) for file in files.values() if not file.is_file()]
     if missing:
-        asked = f"{preset.name} --study {study}" + (f" --steps {steps}" if steps else "")
-        raise FileNotFoundError(f"{missing[0]} does not exist: run python -m mmgsd run models {asked}")
+        options = f"{preset.name} --study {study}" + (f" --steps {steps}" if steps else "")
+        raise FileNotFoundError(f"{missing[0]} does not exist: run python -m mmgsd run models {options}")
     how = {"photographs": photographs, "presets": (preset.name, preset.cluttered)}
     return {key: measure_weights(key, root, weights=file, **how) | {"preset": preset.name, "steps": models[key].steps}
             for key, file in files.items()}  # fmt: skip
@@ -304,11 +304,11 @@ def run(paths: Paths, *, names: Sequence[str] = ("cloth", "rope", "cloth-paper",
     out = paths.root / "data" / "results" / RESULTS
     for name in names:
         rows = measure_rows(name, paths.root, **how)
-        kept = read_results(out)
+        stored = read_results(out)
         for key, row in rows.items():  # photographs are not at everybody's hand: a call without them keeps the row's
-            before = kept.get(key, {})
-            kept[key] = (before if before.get("sha256") == row.get("sha256") else {}) | row
-        print(f"{write_json(out, kept)}: {', '.join(rows)}")
+            before = stored.get(key, {})
+            stored[key] = (before if before.get("sha256") == row.get("sha256") else {}) | row
+        print(f"{write_json(out, stored)}: {', '.join(rows)}")
     return out
 
 

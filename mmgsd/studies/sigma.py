@@ -46,9 +46,9 @@ def run(paths: Paths, *, sigmas_px: Sequence[float] = (), steps: int = 0, overwr
     models = {model.name: model for model in list_models(paths.preset, sigmas_px, steps=steps)}
     dict(run_each(partial(train_and_ask, paths=paths, overwrite=overwrite), models, desc="models"))
     write_study_table(load_preset(paths.preset), paths.root, "sigma", values=sigmas_px, steps=steps)
-    shown = list_shown(paths, steps=steps)[0]
-    count_errors(paths, models.values(), shown.with_name(f"errors_by_{shown.name}"))
-    return shown
+    file = list_shown(paths, steps=steps)[0]
+    count_errors(paths, models.values(), file.with_name(f"errors_by_{file.name}"))
+    return file
 
 
 def count_errors(paths: Paths, models: Iterable[TrainConfig], file: Path) -> Path:
@@ -74,8 +74,8 @@ def tabulate(results: Results, measure: str = "rmse_mean") -> pd.DataFrame:
 
 def tabulate_longer(folder: Path) -> pd.DataFrame:
     """The mean errors with other steps than the studies', of a preset's folder of results: a row a file and object."""
-    found = {path.stem: read_results(path, depth=2) for path in sorted(folder.glob("sigma_*.json"))}
-    tables = {name: tabulate(results).T for name, results in found.items()}
+    stored = {path.stem: read_results(path, depth=2) for path in sorted(folder.glob("sigma_*.json"))}
+    tables = {name: tabulate(results).T for name, results in stored.items()}
     return pd.concat(tables).rename_axis(columns="σ (px)") if tables else pd.DataFrame()
 
 
@@ -89,10 +89,10 @@ def judge_sigma(results: Results) -> Claim:
     """The width of the target."""
     errors = {name: {s: row["rmse_mean"] for s, row in (get(results, "sigma", name) or {}).items()} for name in OBJECTS}
     parts = tuple(is_better(row.get("1"), row[s]) for row in errors.values() for s in row if float(s) > 1) or (None,)
-    shown = [f"{n}: " + ", ".join(f"{say(e)} at {s}" for s, e in row.items()) for n, row in errors.items()]
+    texts = [f"{n}: " + ", ".join(f"{say(e)} at {s}" for s, e in row.items()) for n, row in errors.items()]
     return Claim(
         "sigma", "A target of σ = 1 px is best; every wider one is worse.",
-        "The wider target's error is larger; a part each object and width.", f"{'; '.join(shown)}; one seed", parts,
+        "The wider target's error is larger; a part each object and width.", f"{'; '.join(texts)}; one seed", parts,
         runs="sigma",
     )  # fmt: skip
 

@@ -52,12 +52,12 @@ def run(paths: Paths, *, groups: Sequence[str] = GROUPS, overwrite: bool = False
     return file
 
 
-def replace_maps(folder: Path, found: Results) -> dict[str, Any]:
+def replace_maps(folder: Path, results: Results) -> dict[str, Any]:
     """The study with the errors by ring, `rings`, in place of its maps, which are for its figure."""
-    rows = found.get("symmetry", {})
+    rows = results.get("symmetry", {})
     short = {g: {key: value for key, value in row.items() if key != MAP} |
              ({"rings": measure_rings(row[MAP])} if MAP in row else {}) for g, row in rows.items()}  # fmt: skip
-    return {"symmetry": short} if "symmetry" in found else {}
+    return {"symmetry": short} if "symmetry" in results else {}
 
 
 def describe_symmetry(results: Results) -> Table:
@@ -76,14 +76,14 @@ def judge_group(results: Results) -> Claim:
     rings = {group: get(results, "symmetry", group, "rings") for group in ("v4", "c4")}
     inwards = {group: None if row is None else float(spearmanr(range(len(row) - 1), row[:-1]).statistic)
                for group, row in rings.items()}  # fmt: skip  # without the centre, which is one point
-    known = None not in inwards.values()
-    shown = [f"`{group}`: {say(row[0])} … {say(row[-2])} px, rank correlation {say(inwards[group], 'share')}"
+    complete = None not in inwards.values()
+    texts = [f"`{group}`: {say(row[0])} … {say(row[-2])} px, rank correlation {say(inwards[group], 'share')}"
              for group, row in rings.items() if row]  # fmt: skip
     return Claim(
         "group", "Our conjecture: the errors inside are those of the group `v4`, not of cloth.",
         f"From the border inwards the error grows, ring by ring (rank correlation of {RANKED} or more), under `v4` "
-        "and not under `c4`.", f"rings, outermost … next to the centre, {'; '.join(shown) or '–'}; one seed",
-        (inwards["v4"] >= RANKED > inwards["c4"] if known else None,), runs="symmetry",
+        "and not under `c4`.", f"rings, outermost … next to the centre, {'; '.join(texts) or '–'}; one seed",
+        (inwards["v4"] >= RANKED > inwards["c4"] if complete else None,), runs="symmetry",
     )  # fmt: skip
 
 
@@ -111,8 +111,8 @@ def plot_symmetry_study(places: Mapping[str, Mapping[str, Any]]) -> Figure:
     for group, row in places.items():
         axes[-2].plot(np.array(measure_rings(row[MAP]), float), color=get_colour(group))
     axes[-2].set(xlabel="Points from the border", ylabel="RMSE (px)", ylim=(0, None), xlim=(0, SIDE // 2))
-    _draw_regions(axes[-1], {group: {r: row["rmse_px"] for r, row in shown["regions"].items()}
-                             for group, shown in places.items()})  # fmt: skip
+    _draw_regions(axes[-1], {group: {r: row["rmse_px"] for r, row in summary["regions"].items()}
+                             for group, summary in places.items()})  # fmt: skip
     axes[-1].set_ylabel("RMSE (px)")
     figure.legend(*axes[-1].get_legend_handles_labels(), loc="outside upper right", ncols=len(places), handlelength=1)
     return finish_axes(figure, keep_box=axes[: len(places)])

@@ -73,13 +73,13 @@ class Layout:
 
 def lay_out(table: Table, *, page: bool) -> Layout:
     """The texts of a table's ``page``, or else of the report's."""
-    shown = {title: [c for c in columns if (c.page if page else c.head)] for title, columns in table.blocks.items()}
-    shown = {title: columns for title, columns in shown.items() if columns}
-    columns = [column for block in shown.values() for column in block]
+    blocks = {title: [c for c in columns if (c.page if page else c.head)] for title, columns in table.blocks.items()}
+    blocks = {title: columns for title, columns in blocks.items() if columns}
+    columns = [column for block in blocks.values() for column in block]
     beside = len(columns) * len(table.parts) <= BESIDE
     if beside and len(table.parts) > 1:
-        shown = dict.fromkeys(table.parts, columns)
-    heads = [(title, [c.page if page else c.head for c in block]) for title, block in shown.items()]
+        blocks = dict.fromkeys(table.parts, columns)
+    heads = [(title, [c.page if page else c.head for c in block]) for title, block in blocks.items()]
     groups = [("", table.parts)] if beside else [(part, (part,)) for part in table.parts]
     sections = [(title, _list_lines(table, columns, parts, page=page)) for title, parts in groups]
     return Layout(beside and len(table.parts) > 1, heads, [section for section in sections if section[1]])
@@ -131,11 +131,11 @@ def say_value(row: Results | None, key: str, scale: float, form: str, unit: str 
 
 def _describe_queries(which: str = "", *, page: bool = False) -> list[Column]:
     """Errors over the queries with a visible source, or over ``"_all"``; ``page``: shown there as well."""
-    found = [Column(f"pck@{px}px{which}", f"≤{px}", f"pck@{px}px" if page and px == 20 else "", page_form=".0f",
-                    scale=100) for px in (5, 10, 20)]  # fmt: skip
+    shares = [Column(f"pck@{px}px{which}", f"≤{px}", f"pck@{px}px" if page and px == 20 else "", page_form=".0f",
+                     scale=100) for px in (5, 10, 20)]  # fmt: skip
     return [
         Column(f"rmse_mean{which}", "RMSE", "RMSE px" if page else ""), Column(f"rmse_pooled{which}", "pooled"),
-        Column(f"median{which}", "median", "median px" if page else ""), *found,
+        Column(f"median{which}", "median", "median px" if page else ""), *shares,
         Column(f"swap_rate{which}", "swaps", scale=100, optional=True),
     ]  # fmt: skip
 

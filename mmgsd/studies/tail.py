@@ -69,13 +69,13 @@ def list_matches(matcher: Matcher, data: Dataset, *, config: EvaluateConfig = QU
     mixed = [find_mixed(data, image) for image in range(len(data))]
     widths, frames = measure_widths(data, matcher), []
     for pair, (first, second) in enumerate(ProgressBar(pairs, desc=f"tail of {data.object}", leave=False)):
-        asked = [k for k, point in enumerate(points) if data.visible[first, point]]
-        counts = torch.tensor([len(orbits[k]) for k in asked])
-        if not asked:
+        indices = [k for k, point in enumerate(points) if data.visible[first, point]]
+        counts = torch.tensor([len(orbits[k]) for k in indices])
+        if not indices:
             continue
-        xy = torch.from_numpy(data.xy[first, points[asked]])
+        xy = torch.from_numpy(data.xy[first, points[indices]])
         fit, _ = read_modes(matcher, described[first], described[second], xy, data.size, counts)
-        for k, modes in zip(asked, fit.modes.double().numpy(), strict=True):
+        for k, modes in zip(indices, fit.modes.double().numpy(), strict=True):
             orbit = np.asarray(orbits[k])
             error = compute_mode_errors(modes[None, : len(orbit)], data.xy[second, orbit][None].astype(float))[0]
             seen = data.visible[second, orbit]
@@ -144,8 +144,8 @@ def find_outline_symmetries(mask: np.ndarray) -> list[np.ndarray]:
     mirrors = [np.array([[np.cos(2 * a), np.sin(2 * a)], [np.sin(2 * a), -np.cos(2 * a)]]) for a in angles]
     fits = np.array([measure(mirror) for mirror in mirrors])
     best = (fits >= ALIKE) & (fits >= np.roll(fits, 1)) & (fits > np.roll(fits, -1))
-    kept = [np.eye(2), *(t for t in turns if measure(t) >= ALIKE), *(mirrors[k] for k in np.flatnonzero(best))]
-    return [np.column_stack([linear, middle - linear @ middle]) for linear in kept]
+    maps = [np.eye(2), *(t for t in turns if measure(t) >= ALIKE), *(mirrors[k] for k in np.flatnonzero(best))]
+    return [np.column_stack([linear, middle - linear @ middle]) for linear in maps]
 
 
 def measure_floors(data: Dataset, config: EvaluateConfig, group: str) -> pd.DataFrame:
@@ -192,16 +192,16 @@ def summarise_tail(matches: pd.DataFrame, floors: pd.DataFrame) -> dict[str, dic
     """
     tail = matches[matches.rmse_px > TAIL_PX]
     total = np.square(tail.error_px).sum()
-    found = {"all": _summarise(matches, matches, tail, total)}
+    summary = {"all": _summarise(matches, matches, tail, total)}
     for cause in CAUSES:
-        found[cause] = _summarise(matches[matches.cause == cause], matches, tail[tail.cause == cause], total)
+        summary[cause] = _summarise(matches[matches.cause == cause], matches, tail[tail.cause == cause], total)
     queries = matches.groupby("query").rmse_px.first()
-    found["all"] |= {"queries": round(float((queries > TAIL_PX).mean()), 4),
-                     "of_error": round(float(queries[queries > TAIL_PX].sum() / queries.sum()), 4)}  # fmt: skip
+    summary["all"] |= {"queries": round(float((queries > TAIL_PX).mean()), 4),
+                       "of_error": round(float(queries[queries > TAIL_PX].sum() / queries.sum()), 4)}  # fmt: skip
     for state, rows in floors.groupby("state"):
-        found[f"floor: {state}"] = {"images": len(rows), "ways": round(float((rows.ways > 1).mean()), 4),
-                                    "floor_px": round(float(rows.floor_px.mean()), 2)}  # fmt: skip
-    return found
+        summary[f"floor: {state}"] = {"images": len(rows), "ways": round(float((rows.ways > 1).mean()), 4),
+                                      "floor_px": round(float(rows.floor_px.mean()), 2)}  # fmt: skip
+    return summary
 
 
 def _summarise(rows: pd.DataFrame, every: pd.DataFrame, tail: pd.DataFrame, total: float) -> dict[str, float]:
@@ -232,8 +232,8 @@ def describe_floors(results: Results) -> Table:
     columns = [Column("images", page="images", form="d"),
                Column("ways", page="outline fits more than one way round", form=".0f", scale=100),
                Column("floor_px", page="least error by the outline alone, px")]  # fmt: skip
-    keys = {key: key.removeprefix("floor: ") for found in list_parts(results).values() for key in found
-            if key.startswith("floor: ") and found[key]["ways"]}  # fmt: skip
+    keys = {key: key.removeprefix("floor: ") for summary in list_parts(results).values() for key in summary
+            if key.startswith("floor: ") and summary[key]["ways"]}  # fmt: skip
     rows = list_rows(results, keys)
     parts = [part for part in list_parts(results) if any(part in row for row in rows.values())]
     return Table("state", {"": columns}, rows, parts)

@@ -66,8 +66,8 @@ class Method:
 
 def track(object: str, frames: np.ndarray, xy: np.ndarray) -> Answer:
     """`Matcher.track`."""
-    found = load(object).track(frames, xy)
-    return found.xy, found.visible > LIKELY
+    tracks = load(object).track(frames, xy)
+    return tracks.xy, tracks.visible > LIKELY
 
 
 def match_each(object: str, frames: np.ndarray, xy: np.ndarray, *, nearest: bool) -> Answer:
@@ -86,8 +86,8 @@ def flow_lucas_kanade(object: str, frames: np.ndarray, xy: np.ndarray) -> Answer
 
     def step(before: np.ndarray, after: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where points (P, 2) px are a frame later, and which (P,) were followed."""
-        moved, found, _ = cv2.calcOpticalFlowPyrLK(before, after, points.astype(np.float32)[:, None], None)
-        return moved[:, 0], found[:, 0] > 0
+        moved, status, _ = cv2.calcOpticalFlowPyrLK(before, after, points.astype(np.float32)[:, None], None)
+        return moved[:, 0], status[:, 0] > 0
 
     return _chain(frames, xy, step)
 
@@ -110,10 +110,10 @@ def _chain(frames: np.ndarray, xy: np.ndarray, step: Callable[..., tuple[np.ndar
     grey = [cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in frames]
     places, seen = [xy.astype(float)], [np.ones(len(xy), bool)]
     for before, after in zip(grey, grey[1:], strict=False):
-        moved, found = step(before, after, places[-1])
+        moved, followed = step(before, after, places[-1])
         back, _ = step(after, before, moved)
         inside = ((moved >= 0) & (moved <= np.array(after.shape[::-1]) - 1)).all(1)
-        seen.append(found & inside & (np.linalg.norm(back - places[-1], axis=1) < CONSISTENT_PX))
+        seen.append(followed & inside & (np.linalg.norm(back - places[-1], axis=1) < CONSISTENT_PX))
         places.append(moved)
     return np.stack(places), np.stack(seen)
 
@@ -141,8 +141,8 @@ def run(
     results: dict[str, Any] = {"run": {"films": count, "frames": frames, "scale": scale}, "methods": {}}
     for object in OBJECTS:
         films = make_films(object, Bench(paths.generated / "folding", how), count, frames, scale)
-        asked = [(name, film) for name in METHODS for film in films]
-        bar = ProgressBar(asked, desc=f"track, {object}", unit="film", disable=not progress)
+        pairs = [(name, film) for name in METHODS for film in films]
+        bar = ProgressBar(pairs, desc=f"track, {object}", unit="film", disable=not progress)
         measured = {(name, film): measure_film(name, films[film], paths.generated / "tracking" / f"{name}-{film}.json")
                     for name, film in bar}  # fmt: skip
         results["methods"][object] = {name: summarise({film: measured[name, film] for film in films})
@@ -170,8 +170,8 @@ def make_films(object: str, bench: Bench, count: int, frames: int, scale: float)
             moves = true_moves(find_task(rollout.task).looks[0], bench.demonstrated[rollout.task][0].points, state)
             motion = name.partition("-")[0]
             jobs[name] = film_job(starts[rollout], moves, motion, frames=frames, size=size)
-    made = run_jobs(jobs, bench.folder / "films", **bench.how)
-    return {name: file for name, file in made.items() if not read_state(file).about["fault"]}
+    files = run_jobs(jobs, bench.folder / "films", **bench.how)
+    return {name: file for name, file in files.items() if not read_state(file).about["fault"]}
 
 
 def measure_film(name: str, file: Path, out: Path) -> dict[str, float]:
@@ -179,19 +179,19 @@ def measure_film(name: str, file: Path, out: Path) -> dict[str, float]:
     film, method = read_state(file), METHODS[name]
     weights = find_weights(film.about["object"]).read_bytes() if method.learnt else b""
     mark = {"film": film.about["mark"], "weights": hashlib.sha256(weights).hexdigest(), "version": VERSION}
-    kept, (points, truth) = read_kept(out, mark), find_truth(film)
-    if kept is None:
+    stored, (points, truth) = read_kept(out, mark), find_truth(film)
+    if stored is None:
         xy, seen = method.follow(film.about["object"], film.image, film.xy[0, points])
         places = np.where(np.isfinite(xy), np.round(np.asarray(xy, float), 2), None)
-        kept = {"mark": mark, "xy": places.tolist(), "visible": np.asarray(seen, bool).tolist()}
-        write_json(out, kept)
-    return measure_track(np.array(kept["xy"], float), np.array(kept["visible"]), truth)
+        stored = {"mark": mark, "xy": places.tolist(), "visible": np.asarray(seen, bool).tolist()}
+        write_json(out, stored)
+    return measure_track(np.array(stored["xy"], float), np.array(stored["visible"]), truth)
 
 
 def find_truth(film: State) -> tuple[np.ndarray, Truth]:
     """The material points (S,) that are asked for, and where they and those like them are."""
-    object, asked = film.about["object"], np.array(POINTS[film.about["object"]])
-    points = asked[film.visible[0, asked]]
+    object, all_points = film.about["object"], np.array(POINTS[film.about["object"]])
+    points = all_points[film.visible[0, all_points]]
     likes = load_group(object, DEFAULT_GROUP[object]).permutations[1:, points]  # (G, S)
     xy = film.xy.astype(float)
     return points, Truth(xy[:, points], film.visible[:, points], xy[:, likes], film.image.shape[2:0:-1])

@@ -70,8 +70,8 @@ def run(paths: Paths, *, classical: Sequence[str] = ("sift", "orb"), overwrite: 
     config = load_preset(paths.preset).evaluate
     before, after = ({name: {} for name in OBJECTS} for _ in range(2))
     for model in list_models(paths):
-        asked = (paths.model(model) / WEIGHTS, paths.dataset(model.object), config)
-        out = evaluate_model(*asked, paths.queries(f"{model.name}-uncalibrated"), temperature=1.0, overwrite=overwrite)
+        inputs = (paths.model(model) / WEIGHTS, paths.dataset(model.object), config)
+        out = evaluate_model(*inputs, paths.queries(f"{model.name}-uncalibrated"), temperature=1.0, overwrite=overwrite)
         before[model.object][model.method] = load_queries(out)
         after[model.object][model.method] = load_queries(paths.queries(model.name))
     tables = {name: methods | {m: load_queries(paths.queries(f"{name}-{m}")) for m in BASELINES}
@@ -79,11 +79,11 @@ def run(paths: Paths, *, classical: Sequence[str] = ("sift", "orb"), overwrite: 
     for name, methods in tables.items():
         check_same_questions(methods | {f"{m}, uncalibrated": table for m, table in before[name].items()})
     summary = {when: {name: {m: measured.summarise_uncertainty(table) for m, table in methods.items()}
-                      for name, methods in asked.items()}
-               for when, asked in {"calibrated": tables, "temperature 1": before}.items()}  # fmt: skip
+                      for name, methods in by_object.items()}
+               for when, by_object in {"calibrated": tables, "temperature 1": before}.items()}  # fmt: skip
     file = write_results(summary, paths.results / "uncertainty.json")
-    shown = {o: {m: t for m, t in ts.items() if m in (*METHODS, *classical)} for o, ts in tables.items()}
-    save_figure(plot_risk_coverage(shown), paths.figures / "risk_coverage")
+    selected_tables = {o: {m: t for m, t in ts.items() if m in (*METHODS, *classical)} for o, ts in tables.items()}
+    save_figure(plot_risk_coverage(selected_tables), paths.figures / "risk_coverage")
     save_figure(plot_calibration(before, after), paths.figures / "calibration")
     return file
 
@@ -146,11 +146,11 @@ def judge_inward(results: Results) -> Claim:
     nats = get_regions(results, "c4", "entropy")
     corner, edge, interior = (nats.get(region) for region in ("corner", "edge", "interior"))
     least = hold_all([is_above(edge, corner), is_above(interior, corner)])
-    shown = ", ".join(f"{region} {say(value, 'share')}" for region, value in nats.items())
+    text = ", ".join(f"{region} {say(value, 'share')}" for region, value in nats.items())
     return Claim(
         "inward", "Uncertainty is least at the extremities and grows inwards.",
         f"MMGSD's entropy is at least {NATS} nats lower at the cloth's corners than at edges and inside, a part, and "
-        "lower at edges than inside, a part.", f"nats: {shown}; studies' budget, one seed",
+        "lower at edges than inside, a part.", f"nats: {text}; studies' budget, one seed",
         (least, is_above(interior, edge)), "`08_symmetry_study`", runs="symmetry",
     )  # fmt: skip
 

@@ -36,7 +36,7 @@ def paths(tmp_path: Path) -> Paths:
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     clock = Clock()
     monkeypatch.setattr(stages, "time", clock)
-    monkeypatch.setattr(stages, "_has_made", lambda paths, since: (paths.generated / "made").exists())
+    monkeypatch.setattr(stages, "_has_new_files", lambda paths, since: (paths.generated / "made").exists())
     return clock
 
 
@@ -133,6 +133,6 @@ def test_executed_notebooks_and_locks_are_not_what_a_stage_has_made(paths: Paths
     for name in ("notebooks/01_render.ipynb", "cloth/.partial", ".notebooks.lock"):
         (paths.generated / name).parent.mkdir(parents=True, exist_ok=True)
         (paths.generated / name).touch()
-    assert not stages._has_made(paths, 0.0)
+    assert not stages._has_new_files(paths, 0.0)
     (paths.generated / "cloth" / "dataset.json").touch()
-    assert stages._has_made(paths, 0.0) and not stages._has_made(paths, 3e9)
+    assert stages._has_new_files(paths, 0.0) and not stages._has_new_files(paths, 3e9)

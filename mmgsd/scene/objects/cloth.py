@@ -229,11 +229,11 @@ def _fold_over(rng: np.random.Generator, vertices: np.ndarray, angle: float, sha
     line = along.max() - share * np.ptp(along)
     tangent = vertices[:, :2] @ across
     rim = np.flatnonzero(along > along.max() - 1.5 * SPACING)
-    held = {int(rim[np.argmin(tangent[rim])]), int(rim[np.argmax(tangent[rim])]), int(rim[len(rim) // 2])}
+    grasped = {int(rim[np.argmin(tangent[rim])]), int(rim[np.argmax(tangent[rim])]), int(rim[len(rim) // 2])}
     frames = int(15 + 20 * (along.max() - line))
     reach, skew = rng.uniform(0.85, 1.0), rng.normal(scale=0.05)
     grasps = {}
-    for i in sorted(held):
+    for i in sorted(grasped):
         shift = -2 * reach * (along[i] - line) * (normal + skew * across)
         grasps[i] = arc_path(np.append(shift, 0.03), 0.75 * (along[i] - line), frames)
     return grasps | _pin(rng, np.flatnonzero(along < line - 4 * SPACING), frames), frames
@@ -248,16 +248,16 @@ def _fold_grasped(rng: np.random.Generator, vertices: np.ndarray) -> tuple[Grasp
     """Carry one corner of a cloth (1369, 3) m or two neighbours towards the opposite, as one gripper or two do."""
     corners = np.array([0, SIDE - 1, SIDE**2 - 1, SIDE * (SIDE - 1)])  # around the cloth
     first, hands = int(rng.integers(4)), int(rng.integers(1, 3))
-    held = np.roll(corners, -first)[:hands]
+    grasped = np.roll(corners, -first)[:hands]
     opposite = np.roll(corners, -first - 2)[:hands][::-1]
-    shifts = rng.uniform(0.4, 1.0) * (vertices[opposite, :2] - vertices[held, :2])
+    shifts = rng.uniform(0.4, 1.0) * (vertices[opposite, :2] - vertices[grasped, :2])
     shifts = shifts + rng.normal(scale=0.03, size=shifts.shape)
     length = np.linalg.norm(shifts, axis=1)
     frames = int(15 + 20 * length.max())
     grasps = {int(i): arc_path(np.append(shift, 0.03), 0.4 * far, frames)
-              for i, shift, far in zip(held, shifts, length, strict=True)}  # fmt: skip
-    along = (vertices[:, :2] - vertices[held[0], :2]) @ shifts.mean(axis=0) / max(length.max(), 1e-6)
-    anchors = np.setdiff1d(np.flatnonzero(along > 0.55 * length.max()), held)
+              for i, shift, far in zip(grasped, shifts, length, strict=True)}  # fmt: skip
+    along = (vertices[:, :2] - vertices[grasped[0], :2]) @ shifts.mean(axis=0) / max(length.max(), 1e-6)
+    anchors = np.setdiff1d(np.flatnonzero(along > 0.55 * length.max()), grasped)
     return grasps | _pin(rng, anchors, frames), frames
 
 

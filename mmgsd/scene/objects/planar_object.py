@@ -73,11 +73,11 @@ def load_planar_object(path: Path | str) -> PlanarObject:
     """
     path = Path(path)
     if not path.is_file():
-        known = sorted({*OBJECTS, *(file.stem for file in path.parent.glob("*.json"))})
-        close = difflib.get_close_matches(path.stem, known, n=1)
+        names = sorted({*OBJECTS, *(file.stem for file in path.parent.glob("*.json"))})
+        close = difflib.get_close_matches(path.stem, names, n=1)
         hint = f" (did you mean {close[0]!r}?)" if close else ""
         raise FileNotFoundError(f"{path} does not exist{hint}: it should hold an object's outline or mesh, and its "
-                                f"symmetry; there are {', '.join(known)}")  # fmt: skip
+                                f"symmetry; there are {', '.join(names)}")  # fmt: skip
     values = read_json(path, remedy="write it anew")
     try:
         return _build(path, values)
@@ -224,12 +224,12 @@ def _find_transforms(border: Border, *, faces: bool) -> list[np.ndarray]:
     most = MAX_ORDER // 2 if axes else MAX_ORDER
     fold = next(n for n in range(most, 0, -1) if all(border.measure_miss(turn(360 * j / n)) < TOLERANCE
                                                      for j in range(1, n)))  # fmt: skip
-    found = [turn(360 * j / k) for k in range(2, fold + 1) if fold % k == 0 for j in range(1, k)]
+    transforms = [turn(360 * j / k) for k in range(2, fold + 1) if fold % k == 0 for j in range(1, k)]
     if axes:
         best = min(axes)[1]  # beside an axis, others that are nearly one also leave a border within the tolerance
         angles = ((best + 180 * j / fold) % 180 for j in range(fold))
-        found += [turn_over(a) for a in sorted(round(a, 2) if abs(a - round(a, 2)) < 1e-6 else a for a in angles)]
-    return _close(found)
+        transforms += [turn_over(a) for a in sorted(round(a, 2) if abs(a - round(a, 2)) < 1e-6 else a for a in angles)]
+    return _close(transforms)
 
 
 def _read_transform(entry: Any) -> np.ndarray:
@@ -265,7 +265,7 @@ def _close(generators: list[np.ndarray]) -> list[np.ndarray]:
     for element in group:  # grows while it is walked through
         for generator in generators:
             product = generator @ element
-            if not any(np.allclose(product, known, atol=1e-3) for known in group):
+            if not any(np.allclose(product, member, atol=1e-3) for member in group):
                 group.append(product)
             if len(group) > MAX_ORDER:
                 raise ValueError(f"symmetry must generate at most {MAX_ORDER} elements, like turns by 360 / n degrees "

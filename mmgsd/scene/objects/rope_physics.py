@@ -141,13 +141,13 @@ def pull_rope(
     """
     count = round(LENGTH / thickness / STEP) + 1
     points = resample(centre, count) / thickness
-    held = np.array([round(index / (len(centre) - 1) * (count - 1)) for index, _ in grasps], dtype=int)
+    grasped = np.array([round(index / (len(centre) - 1) * (count - 1)) for index, _ in grasps], dtype=int)
     shifts = np.array([shift for _, shift in grasps], dtype=float).reshape(-1, 2) / thickness
     passed = []
-    for targets in _carry(points[held], shifts):
-        _move(points, held, targets, ROUNDS)
+    for targets in _carry(points[grasped], shifts):
+        _move(points, grasped, targets, ROUNDS)
         passed.append(resample(points * thickness, len(centre)))
-    _move(points, held[:0], np.empty((0, 3)), SETTLE_ROUNDS)  # the grippers let go
+    _move(points, grasped[:0], np.empty((0, 3)), SETTLE_ROUNDS)  # the grippers let go
     return passed, resample(points * thickness, len(centre))
 
 
@@ -165,16 +165,16 @@ def _carry(start: np.ndarray, shifts: np.ndarray) -> np.ndarray:
     return paths
 
 
-def _move(points: np.ndarray, held: np.ndarray, targets: np.ndarray, rounds: int) -> None:
-    """Put the ``held`` of particles (N, 3), STEP apart, at ``targets`` (G, 3), and let the rest follow."""
-    reach = STEP * np.abs(np.arange(len(points)) - held[:, None])  # (G, N)
+def _move(points: np.ndarray, grasped: np.ndarray, targets: np.ndarray, rounds: int) -> None:
+    """Put the ``grasped`` of particles (N, 3), STEP apart, at ``targets`` (G, 3), and let the rest follow."""
+    reach = STEP * np.abs(np.arange(len(points)) - grasped[:, None])  # (G, N)
     for step in range(rounds):
         if step % ROUNDS == 0:
             pairs, distance = _near_pairs(points, 0.0)
-        points[held] = targets
+        points[grasped] = targets
         _follow(points, targets, reach)
         weights = np.where(points[:, 2] < LOW, LYING, 1.0)
-        weights[held] = 1e-6
+        weights[grasped] = 1e-6
         for first in (0, 1, 0, 1):
             _keep_lengths(points, weights, first)
         for stride in BEAM_STRIDES:
@@ -182,7 +182,7 @@ def _move(points: np.ndarray, held: np.ndarray, targets: np.ndarray, rounds: int
         _limit_bends(points)
         _push_apart(points, pairs, distance)
         points[:, 2] = np.maximum(points[:, 2] - FALL, 0.5)
-    points[held] = targets
+    points[grasped] = targets
 
 
 def _follow(points: np.ndarray, targets: np.ndarray, reach: np.ndarray) -> None:

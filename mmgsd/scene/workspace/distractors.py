@@ -127,18 +127,18 @@ def _make_tool(rng: np.random.Generator) -> list[Part]:
 def _make_hand(rng: np.random.Generator) -> list[Part]:
     """Fingers from their tips at the origin, a back and a forearm with a sleeve, upwards along z, flat across x."""
     skin = vary_rgb(rng, SKINS[rng.integers(len(SKINS))], 0.1)
-    solids = []
+    fingers = []
     for k, length in enumerate((0.062, 0.078, 0.084, 0.075)):
         root, spread = (0.0, (k - 1.5) * 0.021, 0.09), rng.normal(scale=0.006)
         bent = (0.02 + rng.uniform(0, 0.03), root[1] + spread, 0.09 - 0.5 * length)
         tip = (0.0, bent[1] + spread, 0.09 - length)
-        solids += [make_capsule(root, bent, 0.0095), make_capsule(bent, tip, 0.009, 0.007)]
-    solids.append(make_capsule((0.0, 0.035, 0.14), (-0.005, 0.075, 0.08), 0.013, 0.009))  # thumb
+        fingers += [make_capsule(root, bent, 0.0095), make_capsule(bent, tip, 0.009, 0.007)]
+    fingers.append(make_capsule((0.0, 0.035, 0.14), (-0.005, 0.075, 0.08), 0.013, 0.009))  # thumb
     back = make_tube([(0.008, 0, z) for z in (0.08, 0.1, 0.14, 0.17, 0.2)], [0.03, 0.042, 0.044, 0.036, 0.03], sides=16)
     back = Solid(back.vertices * (0.45, 1, 1), back.faces, True)
     arm = make_tube([(0.0, 0, z) for z in (0.19, 0.3, 0.6, 1.1)], [0.028, 0.036, 0.045, 0.055], sides=16)
     sleeve = skin if rng.random() < 0.4 else draw_rgb(rng)
-    return [*((solid, skin, False) for solid in (*solids, back)), (arm, sleeve, False)]
+    return [*((solid, skin, False) for solid in (*fingers, back)), (arm, sleeve, False)]
 
 
 def _scale(parts: list[Part], factor: float) -> list[Part]:
