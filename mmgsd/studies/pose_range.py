@@ -243,7 +243,7 @@ def count_findings(results: Results) -> dict[str, str]:
     text = " and ".join(f"{100 * gap:.0f} % ({name})" for name, gap in gaps.items() if gap is not None)
     fewest = min((len(list_seeds(get_rows(results["pose_range"], name, NARROW[-1]), "unimodal"))
                   for name, gap in gaps.items() if gap is not None), default=0)  # fmt: skip
-    return {"narrow": text or "by an unknown share", "seeds": ", one seed" if fewest == 1 else ""}
+    return {"narrow": text or "by an unknown share", "seeds": {1: ", one seed", 2: ", two seeds"}.get(fewest, "")}
 
 
 STUDY = Study(
