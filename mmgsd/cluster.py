@@ -1,7 +1,7 @@
 """A Dask cluster of others', or one of processes here.
 
 The address of others' leads to a scheduler, which has workers, or a user is told what is missing. Dask is imported
-where it is used: it takes as long as all else that a notebook which only shows results needs besides torch.
+where it is used: who only shows results does not wait for it.
 """
 
 from __future__ import annotations

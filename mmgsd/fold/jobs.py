@@ -42,11 +42,9 @@ def start_job(task: Task, start: str, ground: str, seed: int, *, turn_deg: float
     """
     check_choice("start", start, STARTS[task.object])
     check_choice("ground", ground, GROUNDS if turn_deg is None else ("plain",))
-    job = _begin("start", task, start, ground, seed)
-    if turn_deg is None:
-        return job
-    check("turn_deg", turn_deg, "between 0 and 180", 0 <= turn_deg <= 180)
-    return _marked({name: value for name, value in job.items() if name != "mark"} | {"turn_deg": float(turn_deg)})
+    check("turn_deg", turn_deg, "None, or between 0 and 180", turn_deg is None or 0 <= turn_deg <= 180)
+    limit = {} if turn_deg is None else {"turn_deg": float(turn_deg)}
+    return _begin("start", task, start, ground, seed, **limit)
 
 
 def demonstration_job(task: Task, seed: int) -> dict:
@@ -98,10 +96,10 @@ def _read_moves(moves: Sequence[PixelMove]) -> list[list[list[float]]]:
     return pixels.reshape(-1, 2, 2).tolist()
 
 
-def _begin(kind: str, task: Task, start: str, ground: str, seed: int) -> dict:
+def _begin(kind: str, task: Task, start: str, ground: str, seed: int, **limit: float) -> dict:
     find_task(task.name)
     what = {"kind": kind, "task": task.name, "object": task.object, "start": start, "ground": ground}
-    return _marked(what | {"seed": read_count("seed", seed)})
+    return _marked(what | {"seed": read_count("seed", seed)} | limit)
 
 
 def _go_on(state: Path, job: dict) -> dict:

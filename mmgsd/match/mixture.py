@@ -48,8 +48,8 @@ class ModeReadout:
 
     ``shape_prior``: heatmap mass by which modes are a priori round and equally wide, greater than 0; their common width
     is the mean of theirs, or with ``median_width`` the median. ``exponent``, at least 1: they are fitted to the heatmap
-    raised to it. ``mean_exponent``, at least 1: each then lies at the mean
-    of its share of the heatmap raised to it. Weights and covariances are those of the shares of the heatmap itself.
+    raised to it. ``mean_exponent``, at least 1: each then lies at the mean of its share of the heatmap raised to it.
+    Weights and covariances are those of the shares of the heatmap itself.
     """
 
     shape_prior: float = ROUNDNESS

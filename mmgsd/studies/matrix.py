@@ -313,11 +313,11 @@ def main(
         raise ValueError(f"--study and --seeds are two different lists of models: give one, got {study!r} and {seeds}")
     config = load_preset(preset)
     tasks = [task for task in choose_tasks(config, study=study, seeds=seeds, steps=steps) if only in name_task(task)]
+    if not tasks:
+        raise ValueError(f"--only {only!r}: no model or baseline of the preset {config.name} has a name with that")
     if missing:
         if not seeds:
             raise ValueError("--missing must be given with --seeds")
         tasks = drop_done(tasks, Paths(find_root(), config.name), f"seeds_{steps}.json" if steps else "seeds.json")
-    elif not tasks:
-        raise ValueError(f"--only {only!r}: no model or baseline of the preset {config.name} has a name with that")
     options = {"study": study, "seeds": seeds, "steps": steps}
     run_matrix(Paths(find_root(), config.name), tasks, **options, scheduler=read_scheduler("--scheduler", scheduler))

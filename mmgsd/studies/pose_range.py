@@ -223,7 +223,8 @@ def judge_one_match(results: Results) -> Claim:
         "Our conjecture: one match teaches as much as all where poses are uniform, and less where they are limited.",
         f"Within {' and '.join(map(say_limit, NARROW))} Unimodal's error is above MMGSD's by more than "
         f"{100 * MARGIN:.0f} %, and by more than at any pose; means over seeds, a part each object.",
-        f"Unimodal above MMGSD by: {'; '.join(texts)}", tuple(parts), "`.venv/bin/python -m mmgsd run pose_range`",
+        f"Unimodal above MMGSD by: {'; '.join(texts)}{_say_seeds(rows)}", tuple(parts),
+        "`.venv/bin/python -m mmgsd run pose_range`",
     )  # fmt: skip
 
 
@@ -241,9 +242,13 @@ def count_findings(results: Results) -> dict[str, str]:
     """By how much Unimodal's error is above MMGSD's within the wider of the narrow limits."""
     gaps = {name: _compute_gap(results.get("pose_range", {}), name, NARROW[-1]) for name in OBJECTS}
     text = " and ".join(f"{100 * gap:.0f} % ({name})" for name, gap in gaps.items() if gap is not None)
-    fewest = min((len(list_seeds(get_rows(results["pose_range"], name, NARROW[-1]), "unimodal"))
-                  for name, gap in gaps.items() if gap is not None), default=0)  # fmt: skip
-    return {"narrow": text or "by an unknown share", "seeds": {1: ", one seed", 2: ", two seeds"}.get(fewest, "")}
+    return {"narrow": text or "by an unknown share", "seeds": _say_seeds(results.get("pose_range", {}))}
+
+
+def _say_seeds(results: Results) -> str:
+    """How many seeds there are at least of Unimodal, where that is fewer than `SEEDS`."""
+    counts = [len(list_seeds(get_rows(results, name, limit), "unimodal")) for name in results for limit in LIMITS_DEG]
+    return {1: ", one seed", 2: ", two seeds"}.get(min((count for count in counts if count), default=SEEDS), "")
 
 
 STUDY = Study(

@@ -67,8 +67,8 @@ WAYS = {
     "flipped": Way("heatmaps of both mirror images averaged", flipped=True),
     "median": Way("median width as the prior", median=True),
     "peaks": Way("likelier of two fits: the peaks", peaks=True),
-    "joint": Way("likelier of two fits: the joint answer", joint=True),
-    "starts": Way("likeliest of all three", peaks=True, joint=True),
+    "joint": Way("likelier of two fits: the joint answer, told image0's mask", joint=True),
+    "starts": Way("likeliest of all three, told it, too", peaks=True, joint=True),
     "truth": Way("fit started at the truth", truth=True),
 }
 
@@ -149,7 +149,10 @@ def _make_answer(
 def _predict_jointly(
     matcher: Matcher, mask: np.ndarray, source: Outputs, target: Outputs, xy: np.ndarray
 ) -> Tensor:
-    """(S, n, 2) px: where each pixel of the first image has its matches by what its neighbours' say (`predict`)."""
+    """(S, n, 2) px: where each pixel of the first image has its matches by what its neighbours' say (`predict`).
+
+    ``mask`` (H, W) bool is where it shows the object, by the data set.
+    """
     size, places = mask.shape[::-1], spread_places(mask)
     everywhere = np.concatenate([xy, places])
     heatmap = matcher.compute_heatmaps(source, target, torch.from_numpy(everywhere), size)
