@@ -23,13 +23,15 @@ UV ?= uv
 FIND_LINKS ?=
 
 # --- the environment of every run --------------------------------------------------------------------------------
+# Modules are compiled once, not by each of the hundred processes of a run.
+unexport PYTHONDONTWRITEBYTECODE
 # Keep freed memory instead of handing it back to the system after each step: about 10 % of training time (glibc).
 export MALLOC_MMAP_THRESHOLD_ ?= 4294967296
 export MALLOC_TRIM_THRESHOLD_ ?= 8589934592
 
 TORCH := 2.13.0
 PY := .venv/bin/python
-PIP := env -u PYTHONDONTWRITEBYTECODE $(PY) -m pip --disable-pip-version-check install --quiet --only-binary :all:
+PIP := $(PY) -m pip --disable-pip-version-check install --quiet --only-binary :all:
 STAMP := .venv/.installed
 SITE := .venv/docs
 PYTEST := OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(PY) -m pytest --numprocesses $(JOBS) --dist loadfile --no-loadscope-reorder

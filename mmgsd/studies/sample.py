@@ -14,7 +14,7 @@ from mmgsd.measure.questions import ask, model_answer
 from mmgsd.studies.models import SHIPPED
 
 PAPER_SIZE = ("mmgsd", "spcl")  # methods whose shipped weights learnt from the paper's images alone
-QUESTIONS = EvaluateConfig(pairs=40, points=65)  # a few thousand queries
+QUESTIONS = EvaluateConfig(pairs=20, points=65)  # 1,300 queries
 
 
 def load_sample(root: Path, object: str) -> Dataset:

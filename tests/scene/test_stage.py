@@ -25,7 +25,7 @@ from mmgsd.scene import stage
 from mmgsd.scene.stage import RenderError, plan_batches, render_batch, render_dataset
 
 CONFIG = RenderConfig(object="rope", train_images=3, test_images=2, views=1, samples=1, seed=5)
-FEW = dataclasses.replace(CONFIG, train_images=2, test_images=1)  # of what Blender renders here
+FEW = dataclasses.replace(CONFIG, train_images=1, test_images=1)  # of what Blender renders here
 # without a main guard: a plain script may render
 SCRIPT = """
 import sys
@@ -33,7 +33,7 @@ from pathlib import Path
 from mmgsd.scene import stage
 from mmgsd.config import RenderConfig
 stage.IMAGES_A_BATCH = 1
-config = RenderConfig(object="rope", train_images=2, test_images=1, views=1, samples=1, seed=5)
+config = RenderConfig(object="rope", train_images=1, test_images=1, views=1, samples=1, seed=5)
 how = {"workers": int(sys.argv[2]), "scheduler": sys.argv[3]}
 stage.render_dataset(config, Path(sys.argv[1]), progress=False, **how)
 """
@@ -90,7 +90,7 @@ def test_a_killed_rendering_goes_on_and_ends_with_the_same_bytes(undisturbed: Pa
     assert kept and not killed.exists()
     assert start(killed, 1).wait(300) == 0
     assert read_tree(undisturbed) == read_tree(killed)
-    assert check_dataset(killed).images.to_list() == [2, 1]
+    assert check_dataset(killed).images.to_list() == [1, 1]
     with pytest.raises(ValueError, match="seed: 5 there, 6 asked for"):
         render_dataset(dataclasses.replace(FEW, seed=6), killed)
 
@@ -109,7 +109,7 @@ def test_test_images_alone_are_those_of_the_whole_set_and_the_rest_can_follow(
     render_dataset(FEW, folder, progress=False)
     assert read_tree(folder) == read_tree(whole)
     assert render_dataset(FEW, folder, only_test=True, progress=False) == folder
-    assert len(load_dataset(folder, "train")) == 2 and not (tmp_path / "alone.partial").exists()
+    assert len(load_dataset(folder, "train")) == 1 and not (tmp_path / "alone.partial").exists()
 
 
 def test_a_lost_worker_of_a_foreign_cluster_costs_nothing_but_time(undisturbed: Path, tmp_path: Path) -> None:
@@ -198,9 +198,9 @@ def test_a_changed_object_is_another_data_set(tmp_path: Path, monkeypatch: pytes
     file.parent.mkdir(parents=True)
     file.write_text('{"outline": [[0, 0], [4, 0], [4, 2], [0, 2]], "symmetry": "turns"}')
     config, folder = RenderConfig(object="sheet", train_images=1, test_images=1, views=1), tmp_path / "sheet"
-    data = load_dataset(render_dataset(config, folder, progress=False))
+    data = load_dataset(render_dataset(config, folder, only_test=True, progress=False), "test")
     assert (data.group().order, data.n_points) == (2, len(data.group().permutations[0]))
-    assert render_dataset(config, folder, progress=False) == folder
+    assert render_dataset(config, folder, only_test=True, progress=False) == folder
     file.write_text('{"outline": [[0, 0], [4, 0], [4, 3], [0, 3]], "symmetry": "turns"}')
     with pytest.raises(ValueError, match="scenes: .* there, .* asked for"):
         render_dataset(config, folder, progress=False)

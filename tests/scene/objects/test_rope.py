@@ -12,7 +12,7 @@ from mmgsd.scene.objects import rope_shape
 from mmgsd.scene.objects.rope_physics import LENGTH, bend, pull_rope, resample
 from mmgsd.scene.objects.rope_shape import STATES, RopeShape, find_crossings, own_parts, sample_rope
 
-SEEDS = 60
+SEEDS = 36
 
 
 @pytest.fixture(scope="module")
