@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 ANSWER = 10.0  # s that a scheduler has to answer
 PATIENCE = 30.0  # s that it has to take a client, and to have a worker before it is said that there is none
 LOOK = 1.0  # s between two looks at the workers
+AWAKE = {"distributed.scheduler.worker-ttl": None}  # a machine that slept loses no worker, silent as it was
 # nobody else is to reach scheduler, workers and their pages
 LOOPBACK = {"dashboard_address": "127.0.0.1:0", "worker_dashboard_address": "127.0.0.1:0", "silence_logs": "ERROR"}
 
@@ -74,9 +75,13 @@ def open_threads(count: int = 0) -> Iterator[Client]:
 
 @contextlib.contextmanager
 def _open_cluster(**how: Any) -> Iterator[Client]:
+    import dask
     from dask.distributed import Client, LocalCluster
 
-    with unchanged_environment(), LocalCluster(**how, **LOOPBACK) as cluster, Client(cluster) as client:
+    with (
+        unchanged_environment(), dask.config.set(AWAKE),
+        LocalCluster(**how, **LOOPBACK) as cluster, Client(cluster) as client,
+    ):  # fmt: skip
         yield client
 
 

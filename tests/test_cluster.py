@@ -89,3 +89,13 @@ def test_as_many_threads_as_cores_that_may_be_used(
     monkeypatch.setattr(dask.system, "_try_extract_cgroup_cpu_quota", lambda: quota)
     with open_threads() as client:
         assert sum(client.nthreads().values()) == expected
+
+
+def test_a_machine_that_slept_loses_no_worker() -> None:
+    with open_threads(1) as client:
+        scheduler = client.cluster.scheduler
+        for worker in scheduler.workers.values():
+            worker.last_seen -= 24 * 3600  # s
+        if check := scheduler.periodic_callbacks.get("worker-ttl"):
+            client.sync(check.callback)
+        assert client.submit(str, 1).result(timeout=5) == "1"
