@@ -43,8 +43,8 @@ def list_anchors(path: Path) -> set[str]:
 
 
 def get_prose(path: Path) -> str:
-    """A document without its code, tables and pictures."""
-    text = re.sub(r"^```.*?^```", "", path.read_text("utf-8"), flags=re.DOTALL | re.MULTILINE)
+    """A document without its tables, pictures and marks."""
+    text = path.read_text("utf-8")
     return "\n".join(line for line in text.splitlines() if not line.startswith(("|", "![", "<!--")))
 
 
@@ -159,14 +159,15 @@ def test_the_lines_of_python_run(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(("name", "words"), [("README.md", 1000), ("data/results/README.md", 1500),
-                                             ("data/results/shipped.md", 1000)])
+                                             ("data/results/shipped.md", 1200)])
 def test_what_is_to_be_short_is_short(name: str, words: int) -> None:
     assert len(get_prose(ROOT / name).split()) <= words
 
 
 def test_the_readme_has_few_numbers_in_its_sentences() -> None:
-    sentences = re.sub(r"\]\([^)]*\)|`[^`]*`", "", get_prose(ROOT / "README.md"))
-    assert len(re.findall(r"\d[\d.,]*", sentences)) <= 25
+    code = re.compile(r"^```.*?^```|\]\([^)]*\)|`[^`]*`", re.DOTALL | re.MULTILINE)
+    sentences = code.sub("", get_prose(ROOT / "README.md"))
+    assert len(re.findall(r"\d[\d.,]*", sentences)) <= 22
 
 
 @pytest.mark.parametrize("path", FILLED, ids=lambda path: str(path.relative_to(ROOT)))

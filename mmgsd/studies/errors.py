@@ -26,7 +26,7 @@ from mmgsd.paths import Paths, find_shipped
 from mmgsd.studies.claims import NATS, Claim, get, is_above, say
 from mmgsd.studies.models import SHIPPED, configure_model, get_colour
 from mmgsd.studies.parameters import check_images, check_made
-from mmgsd.studies.registry import Finding, Results, Shown, Study
+from mmgsd.studies.registry import Results, Shown, Study
 from mmgsd.studies.table import Table, describe_objects
 
 SEEN, KNOT, OTHERS = ("seen", "hidden"), "overhand knot", "other states"  # kinds of queries; a rope's states
@@ -171,12 +171,6 @@ def judge_hidden(results: Results) -> Claim:
     )  # fmt: skip
 
 
-def count_findings(results: Results) -> dict[str, str]:
-    """What is left of the cloth's error where no match is hidden."""
-    hidden = results["errors"]["cloth"]
-    return {"seen": f"{100 * hidden['no match hidden'] / hidden['all']:.0f} %"}
-
-
 @style.styled
 def plot_error_analysis(tables: Mapping[str, pd.DataFrame]) -> Figure:
     """A row an object ({object: `describe_queries`}): mean RMSE by states, and against what may explain it.
@@ -266,9 +260,4 @@ STUDY = Study(
     "errors", 90, run, check, "09_error_analysis", ("errors", "entropy"), list_shown,
     tables={"errors": Shown("paper/errors.json", describe_difficulties, "errors_table")},
     claims=(judge_hidden,),
-    findings=(
-        Finding(7, "Hidden matches",
-                " are a part of the cloth's error: queries without one have {seen} of the mean error.",
-                "where-is-the-error", count_findings),
-    ),
 )  # fmt: skip

@@ -190,7 +190,7 @@ def count_findings(results: Results) -> dict[str, str]:
         "plain": _list_both(results, "mmgsd_plain"),
         "gain": _say_gains(results, "mmgsd_plain", "spcl"),
         "spcl": _say_gains(results, "mmgsd", "spcl"), "dense": _say_gains(results, "mmgsd", "spcl_dense"),
-        "unimodal": f"{100 * more:.0f} %", "deep": _list_both(results, "mmgsd_fine_deep", " px"),
+        "unimodal": f"{100 * more:.0f} %",
     }  # fmt: skip
 
 
@@ -326,8 +326,6 @@ STUDY = Study(
         Finding(4, "Telling all matches",
                 " helps little where any pose is as probable: told one, Unimodal has {unimodal} more error at most.",
                 "which-method-is-best", count_findings),
-        Finding(6, "More training", ", larger images and a deeper network take MMGSD to {deep}.",
-                "does-more-training-help", count_findings),
     ),
     compared=ERROR_MEASURES,
 )  # fmt: skip

@@ -259,7 +259,7 @@ STUDY = Study(
     tables={"uncertainty": Shown("paper/uncertainty.json", describe_uncertainty, "uncertainty_table")},
     claims=(judge_entropy, judge_inward),
     findings=(
-        Finding(8, "Entropy ranks errors", " by a rank correlation of {ranks}: the less certain can be refused.",
+        Finding(6, "Entropy ranks errors", " by a rank correlation of {ranks}: the less certain can be refused.",
                 "does-an-answer-know-how-wrong-it-is", count_findings),
     ),
     compared={
