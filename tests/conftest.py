@@ -54,6 +54,14 @@ def backbone(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[], 
 
 
 @pytest.fixture(scope="session", autouse=True)
+def unflushed() -> Iterator[None]:
+    """What a test writes need not outlive a loss of power."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda handle: None)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
 def few_questions() -> Iterator[None]:
     """Training asks a few questions where it validates itself and looks for a bandwidth: most of its time here."""
     with pytest.MonkeyPatch.context() as patch:
