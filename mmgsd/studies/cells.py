@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 
-from mmgsd.checks import check_choice
 from mmgsd.config import OBJECTS, TrainConfig, load_preset
 from mmgsd.learn.training import check_start, train_model
 from mmgsd.measure.evaluation import evaluate_model, load_queries, summarise
@@ -27,7 +26,7 @@ from mmgsd.paths import Paths
 from mmgsd.studies.claims import Claim, get, is_better, say
 from mmgsd.studies.matrix import list_missing, measure_each
 from mmgsd.studies.models import ITS_OWN, Model, by_object, configure_study, times
-from mmgsd.studies.parameters import check_images
+from mmgsd.studies.parameters import check_images, choose_objects
 from mmgsd.studies.registry import Results, Shown, Study
 from mmgsd.studies.table import Column, Table, collect_rows
 
@@ -52,8 +51,7 @@ def list_models(preset: str, object: str) -> dict[str, TrainConfig]:
 
 def check(paths: Paths, *, objects: str | Sequence[str] = OBJECTS) -> None:
     """ValueError for other objects, FileNotFoundError where their images or the models to start from are missing."""
-    for name in _list_objects(objects):
-        check_choice("objects", name, OBJECTS)
+    for name in choose_objects(objects):
         check_images(paths, [name], split="train")
         check_start(list_models(paths.preset, name)[COARSE], paths.model(list_models(paths.preset, name)[START]).parent)
 
@@ -64,7 +62,7 @@ def run(paths: Paths, *, objects: str | Sequence[str] = OBJECTS) -> Path:
     A row that is stored of the same training is kept.
     """
     file = paths.results / "cells.json"
-    for name in _list_objects(objects):
+    for name in choose_objects(objects):
         models = list_missing(list_models(paths.preset, name), file, [name])
         measure_each(models, file, [name], partial(_measure, paths=paths), desc=name)
     return file
@@ -80,10 +78,6 @@ def _measure(model: TrainConfig, *, paths: Paths, progress: bool) -> dict[str, A
     table = evaluate_model(weights, data, fewer, paths.queries(f"{model.name}-cells"), progress=progress)
     widths = load_queries(table).spread_px.explode().to_numpy(float)
     return summarise({"": table})[""] | {"width_px": float(np.median(widths)), "run": describe_run(weights)}
-
-
-def _list_objects(objects: str | Sequence[str]) -> list[str]:
-    return [objects] if isinstance(objects, str) else list(objects)
 
 
 def describe_cells(results: Results) -> Table:

@@ -16,8 +16,8 @@ from collections.abc import Callable, Collection, Iterable, Mapping, MutableMapp
 from pathlib import Path
 from typing import Any
 
-from mmgsd.checks import check, describe_choices, read_flag  # noqa: F401  # a reader as well
-from mmgsd.config import PRESETS, TrainConfig
+from mmgsd.checks import check, check_choice, describe_choices, read_flag  # noqa: F401  # a reader as well
+from mmgsd.config import OBJECTS, PRESETS, TrainConfig
 from mmgsd.paths import Paths, find_root, find_shipped
 from mmgsd.studies.models import list_rows
 
@@ -44,6 +44,14 @@ def read_parameters(namespace: MutableMapping[str, Any], **readers: Reader) -> N
 def open_paths(preset: str) -> Paths:
     """Where a preset's files lie in this checkout."""
     return Paths(find_root(), preset)
+
+
+def choose_objects(objects: str | Iterable[str]) -> list[str]:
+    """The cloth, the rope, or both, as a study is told; ValueError for others."""
+    names = [objects] if isinstance(objects, str) else list(objects)
+    for name in names:
+        check_choice("objects", name, OBJECTS)
+    return names
 
 
 def check_made(paths: Paths, by: str, files: Iterable[Path], **options: str) -> None:

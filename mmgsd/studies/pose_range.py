@@ -22,7 +22,7 @@ from typing import Any
 from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 
-from mmgsd.checks import check_choice, read_count
+from mmgsd.checks import read_count
 from mmgsd.config import OBJECTS, TrainConfig, load_preset
 from mmgsd.figures.style import PAGE_IN, finish_axes, save_figure, styled
 from mmgsd.fold.moves import AGREE
@@ -35,6 +35,7 @@ from mmgsd.studies.bench import Bench, list_limited, measure_success
 from mmgsd.studies.claims import MARGIN, Claim, get
 from mmgsd.studies.matrix import list_missing, measure_each, train_and_measure
 from mmgsd.studies.models import ROWS, Model, configure_study, get_colour, get_label, get_line_style
+from mmgsd.studies.parameters import choose_objects
 from mmgsd.studies.policies import Policy
 from mmgsd.studies.registry import Finding, Results, Shown, Study, read_table
 from mmgsd.studies.seeds import compare_seeds, list_seeds, say_seeds
@@ -69,8 +70,7 @@ def check(
     read_count("folds", folds)
     if read_count("seeds", seeds) < 1:
         raise ValueError(f"seeds must be at least 1, got {seeds}")
-    for name in _list_objects(objects):
-        check_choice("objects", name, OBJECTS)
+    choose_objects(objects)
 
 
 def run(
@@ -82,7 +82,7 @@ def run(
     is stored of the same model is kept: neither its images nor its weights are needed again.
     """
     file = paths.results / "pose_range.json"
-    arms = [(name, limit) for name in _list_objects(objects) for limit in LIMITS_DEG]
+    arms = [(name, limit) for name in choose_objects(objects) for limit in LIMITS_DEG]
     for name, limit in ProgressBar(arms, desc="limits"):
         place = name, str(limit)
         models = list_missing(list_models(paths.preset, name, seeds), file, place)
@@ -123,10 +123,6 @@ def _fold(paths: Paths, object: str, limit: int, count: int) -> None:
     for key in models:
         rows[key]["folds"] = shares[f"{key}-{limit}"] | {"rollouts": count}
     write_results(results, file)
-
-
-def _list_objects(objects: str | Sequence[str]) -> list[str]:
-    return [objects] if isinstance(objects, str) else list(objects)
 
 
 def get_rows(results: Results, object: str, limit: int, poses: str = "within") -> dict[str, Any]:

@@ -1,0 +1,41 @@
+"""Prior work's ways to break the symmetry: what is trained, for how long, and which rows are written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from mmgsd.measure.evaluation import read_results, write_results
+from mmgsd.paths import Paths
+from mmgsd.studies import broken_symmetry
+
+
+@pytest.fixture
+def trained(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:
+    """(object, steps) of each model that is asked for; its row is written without training."""
+    asked: list[tuple[str, int]] = []
+
+    def measure(paths, object, row, images, steps, *, overwrite):
+        asked.append((object, steps))
+        return {"rmse_mean": float(steps)}
+
+    monkeypatch.setattr(broken_symmetry, "_measure", measure)
+    return asked
+
+
+def test_other_steps_have_a_file_of_their_own_and_rows_of_other_objects_stay(tmp_path: Path, trained: list) -> None:
+    paths = Paths(tmp_path, "paper")
+    (file,) = broken_symmetry.list_shown(paths, steps=4000)
+    write_results({"cloth, any rotation": {"rmse_mean": 1.0}}, file)
+    assert broken_symmetry.run(paths, steps=4000, objects="rope") == file
+    rows = read_results(file)
+    assert set(rows) == {"cloth, any rotation", "rope, plain", "rope, ball at one end"}
+    assert trained == [("rope", 4000)] * 2 and rows["rope, plain"]["rmse_mean"] == 4000
+    assert broken_symmetry.run(paths).name == "broken_symmetry.json" and len(trained) == 6
+
+
+@pytest.mark.parametrize(("name", "value"), [("steps", -1), ("objects", "towel")])
+def test_options_are_checked_before_anything_is_rendered(tmp_path: Path, name: str, value: object) -> None:
+    with pytest.raises(ValueError, match=name):
+        broken_symmetry.check(Paths(tmp_path, "paper"), **{name: value})
