@@ -28,6 +28,7 @@ from mmgsd.studies import pose_range
 from mmgsd.studies.claims import get
 from mmgsd.studies.matrix import list_missing, measure_each, train_and_measure
 from mmgsd.studies.models import Model, configure_study, get_colour, get_label, list_rows
+from mmgsd.studies.parameters import choose_objects
 from mmgsd.studies.registry import Results, Shown, Study
 from mmgsd.studies.seeds import SEEDS, compare_seeds, say_tested
 from mmgsd.studies.shipped import Rows, get_photographs, list_names
@@ -67,7 +68,7 @@ def run(
     A row that is stored of the same model is kept: neither its images nor its weights are needed again.
     """
     file, kinds = paths.results / "robustness.json", (paths.preset, load_preset(paths.preset).cluttered)
-    for name in ProgressBar([objects] if isinstance(objects, str) else objects, desc="objects"):
+    for name in ProgressBar(choose_objects(objects), desc="objects"):
         models = list_missing(list_models(paths.preset, name, seeds, steps), file, (name,))
         images = {where: render_dataset(load_preset(kind).render[name], Paths(paths.root, kind).dataset(name))
                   for where, kind in zip(WHERE, kinds, strict=True)} if models else {}  # fmt: skip
