@@ -1,7 +1,8 @@
 """A folder of static files that matches pictures in a browser, by ONNX Runtime Web; docs/page.md says how to host it.
 
-The scripts lie beside this file: ``page/mixture.js`` is `mmgsd.match.mixture`, ``page/answer.js`` the `Matcher`, and
-``page/page.js`` what is seen, with the explorer's pictures and marks. The runtime is taken from its npm package.
+The scripts lie beside this file: ``page/mixture.js`` is `mmgsd.match.mixture` and `em`, ``page/answer.js`` the
+`Matcher`, and ``page/page.js`` what is seen, with the explorer's pictures and marks. The runtime is taken from its npm
+package.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from mmgsd.config import OBJECTS
 from mmgsd.extras.exporting import describe_shrinkage, export_onnx
 from mmgsd.figures.style import HEAT
 from mmgsd.files import check_ours, read_json, replace_folder, scratch_folder, write_json, write_text
-from mmgsd.match import mixture
+from mmgsd.match import em, mixture
 from mmgsd.match.match import LIKELY, RADIUS_PX
 from mmgsd.match.matcher import Matcher
 from mmgsd.model import heads
@@ -111,12 +112,12 @@ def _make_check(network: Path, least: int) -> dict[str, Any]:
             "tolerance": CHECK_TOLERANCE * float(np.abs(descriptors).max())}  # fmt: skip
 
 
-def describe_mixture(readout: mixture.ModeReadout) -> dict[str, Any]:
+def describe_mixture(readout: em.ModeReadout) -> dict[str, Any]:
     """How ``page/mixture.js`` fits, so that it is `mmgsd.match.mixture.fit_modes`."""
-    names = {"annealing", "annealing_cycles", "cycles", "leap", "spread", "min_variance", "collapsed", "even",
-             "prior_weight", "ellipse"}  # fmt: skip
-    settings = {name: getattr(mixture, name.upper()) for name in sorted(names)}
-    settings |= {"tolerance": mixture.TOLERANCE_CELLS, "kernel": mixture.KERNEL_CELLS}
+    names = dict.fromkeys(("annealing", "annealing_cycles", "collapsed", "ellipse", "even"), mixture)
+    names |= dict.fromkeys(("cycles", "leap", "min_variance", "prior_weight", "spread"), em)
+    settings = {name: getattr(module, name.upper()) for name, module in names.items()}
+    settings |= {"tolerance": em.TOLERANCE_CELLS, "kernel": mixture.KERNEL_CELLS}
     return settings | {"roundness": readout.shape_prior, "power": readout.exponent, "sharpness": readout.mean_exponent}
 
 

@@ -21,11 +21,12 @@ from torch import Tensor
 
 from mmgsd.checks import check_choice
 from mmgsd.images import check_pixels, check_question
+from mmgsd.match.em import AS_IT_IS, ModeReadout
 from mmgsd.match.features import Extractor, extract_dinov2, extract_imagenet, sample_features
 from mmgsd.match.heatmap import make_match
 from mmgsd.match.match import Match
 from mmgsd.match.matcher import fill_question
-from mmgsd.match.mixture import AS_IT_IS, ModeReadout, check_modes
+from mmgsd.match.mixture import check_modes
 from mmgsd.numerics import own_numerics
 
 EXTRACTORS: dict[str, Extractor] = {"imagenet": extract_imagenet, "dinov2": extract_dinov2}

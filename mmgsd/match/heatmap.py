@@ -10,8 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mmgsd.match.em import AS_IT_IS, ModeReadout
 from mmgsd.match.match import Match
-from mmgsd.match.mixture import AS_IT_IS, Mixture, ModeReadout, check_count, fit_modes, keep_most_probable
+from mmgsd.match.mixture import Mixture, check_count, fit_modes, keep_most_probable
 
 
 def compute_heatmap(squared_distances: Tensor, *, bandwidth: float | None = None, temperature: float = 1.0) -> Tensor:

@@ -15,9 +15,10 @@ from torch import Tensor
 from mmgsd.checks import check, renamed
 from mmgsd.config import CONTRASTIVE, OBJECTS, TrainConfig
 from mmgsd.images import check_aspect, check_mask, check_pixels, to_rgb
+from mmgsd.match.em import ModeReadout
 from mmgsd.match.heatmap import check_scales, compute_heatmap
 from mmgsd.match.match import Match
-from mmgsd.match.mixture import ModeReadout, check_modes
+from mmgsd.match.mixture import check_modes
 from mmgsd.match.pair import Pair
 from mmgsd.match.places import Flat, Place, lay_flat, shrink_sources
 from mmgsd.model.calibration import Calibration

@@ -3,9 +3,7 @@
 Peaks, one after another, are where it starts, and flattened heatmaps are what it is fitted to first: two components
 that share a strong mode while a weak one has none would stay there (deterministic annealing, Ueda and Nakano, Neural
 Networks 1998). Where one component gets next to nothing all the same, they are fitted again from the peaks, and the
-likelier fit counts. A log-density is linear in (1, x, y, x², xy, y²), so an E-step is one matrix product with these six
-numbers of every cell, and an M-step, which needs their means, another. Where modes overlap, expectation-maximisation
-creeps: SQUAREM (Varadhan and Roland, Scandinavian Journal of Statistics 2008) leaps.
+likelier fit counts. The steps themselves are in `mmgsd.match.em`.
 
 Of an image unlike those that a network was taught with, part of the heatmap spreads over all of the object, and draws
 modes away from its peaks. `ModeReadout` says how far modes follow the peaks instead.
@@ -13,7 +11,6 @@ modes away from its peaks. `ModeReadout` says how far modes follow the peaks ins
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -24,46 +21,27 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from mmgsd.checks import check
-from mmgsd.config import MAX_MODES, ROUNDNESS
+from mmgsd.config import MAX_MODES
+from mmgsd.match.em import (
+    AS_IT_IS,
+    SPREAD,
+    ModeReadout,
+    compute_log_densities,
+    compute_log_likelihood,
+    compute_moments,
+    describe_cells,
+    get_chunk,
+    run_cycle,
+    run_em,
+)
 from mmgsd.numerics import own_numerics
 
 ANNEALING, ANNEALING_CYCLES = (4.0, 2.0), 6  # temperatures of the flattened heatmaps fitted first, on half the grid
-CYCLES = 60  # of three EM steps and a leap, at most; a query at rest is left alone
-TOLERANCE_CELLS = 0.0005  # the most that a mode at rest moves in a cycle
-LEAP = 16.0  # the longest leap, in steps
 KERNEL_CELLS = 1.0  # std of the kernel that finds the initial peaks, in cells twice as long and high
-SPREAD = (1 / 12, 10 / 12, 1 / 12)  # of a cell's mass: to second order what bilinear interpolation to pixels does
-MIN_VARIANCE = 0.05  # cells²
 COLLAPSED = 0.2  # of an equal share of the heatmap: a component with less may have left a peak to none
 EVEN = 0.05  # of the mass may lie anywhere where two fits are compared: who explains the background alone is no better
-PRIOR_WEIGHT = 1.0  # heatmap mass by which each component is a priori as likely as any other
-CHUNK = {"cpu": 2**21, "cuda": 2**26}  # numbers in the largest array of a fit
 MOST_MODES, SAMPLES = 8, 200  # n="auto": the most modes tried; a heatmap weighs as much as so many drawn pixels
 ELLIPSE = 5.991  # squared Mahalanobis distance of the ellipse that holds 95 % of a Gaussian in the plane
-
-
-@dataclass(frozen=True)
-class ModeReadout:
-    """How modes are read from a heatmap; ValueError, which names it, for another value.
-
-    ``shape_prior``: heatmap mass by which modes are a priori round and equally wide, greater than 0; their common width
-    is the mean of theirs, or with ``median_width`` the median. ``exponent``, at least 1: they are fitted to the heatmap
-    raised to it. ``mean_exponent``, at least 1: each then lies at the mean of its share of the heatmap raised to it.
-    Weights and covariances are those of the shares of the heatmap itself.
-    """
-
-    shape_prior: float = ROUNDNESS
-    exponent: float = 1.0
-    mean_exponent: float = 1.0
-    median_width: bool = False
-
-    def __post_init__(self) -> None:
-        check("shape_prior", self.shape_prior, "greater than 0", 0 < self.shape_prior < math.inf)
-        for name in ("exponent", "mean_exponent"):
-            check(name, getattr(self, name), "at least 1", 1 <= getattr(self, name) < math.inf)
-
-
-AS_IT_IS = ModeReadout()  # modes at the means of their shares
 
 
 @dataclass(frozen=True)
@@ -103,7 +81,7 @@ def fit_modes(
     powered = _raise(mass, readout.exponent)
     step, middle = torch.stack([xs[1] - xs[0], ys[1] - ys[0]]), torch.stack([xs.mean(), ys.mean()])  # px a cell, px
     starts = [_make_params((each.to(mass) - middle) / step) for each in ([] if start is None else [start]) + [*others]]
-    fitted = [_run_em(powered, each, _describe_cells(grid, mass.device), readout) for each in starts]
+    fitted = [run_em(powered, each, describe_cells(grid, mass.device), readout) for each in starts]
     if start is not None:
         params = fitted.pop(0)
     elif count is None:
@@ -135,10 +113,6 @@ def find_peaks(heatmap: Tensor, n: Tensor, xs: Tensor, ys: Tensor) -> Tensor:
     return (params[..., :2] * step + middle).masked_fill(params[..., 2:3] == 0, torch.nan)
 
 
-# A fit's parameters are (S, N, 6): a component's mean x, y, weight and covariance [[a, b], [b, c]], in cells, from the
-# grid's centre, so that one regularisation suits every image size. Weight 0 marks a component that a query has not.
-
-
 def _fit(mass: Tensor, n: Tensor, n_max: int, grid: tuple[int, int], readout: ModeReadout) -> Tensor:
     """Parameters of the fit to (S, C) mass; where a component collapsed, the likelier of it and one from the peaks."""
     how = n_max, grid, readout
@@ -153,8 +127,8 @@ def _fit(mass: Tensor, n: Tensor, n_max: int, grid: tuple[int, int], readout: Mo
 
 def _keep_likelier(mass: Tensor, params: Tensor, others: Tensor, grid: tuple[int, int]) -> Tensor:
     """Of two fits to each (S, C) mass, of as many components, the likelier."""
-    cells = _describe_cells(grid, mass.device)
-    before, after = (_compute_log_likelihood(mass, each, cells, even=EVEN) for each in (params, others))
+    cells = describe_cells(grid, mass.device)
+    before, after = (compute_log_likelihood(mass, each, cells, even=EVEN) for each in (params, others))
     return torch.where((after > before)[:, None, None], others, params)
 
 
@@ -163,13 +137,13 @@ def _fit_from(
 ) -> Tensor:
     """Parameters of the fit to (S, C) mass, flattened before, in chunks of queries: memory stays bounded."""
     coarse, coarse_grid = _halve(mass, grid)
-    size = _get_chunk(n_max, coarse)
+    size = get_chunk(n_max, coarse)
     parts = zip(coarse.split(size), n.split(size), strict=True)
     starts = [_anneal(temperatures, *part, n_max, coarse_grid, readout) for part in parts]
     params = torch.cat(starts) * mass.new_tensor([2, 2, 1, 4, 4, 4])
     params[..., 0] += 0.5 * (grid[1] % 2)  # an odd grid was halved with a column, or a row, of nothing
     params[..., 1] += 0.5 * (grid[0] % 2)
-    return _run_em(mass, params, _describe_cells(grid, mass.device), readout)
+    return run_em(mass, params, describe_cells(grid, mass.device), readout)
 
 
 def _merge(params: Tensor) -> Tensor:
@@ -200,22 +174,18 @@ def _measure_shares(mass: Tensor, params: Tensor, grid: tuple[int, int], readout
     """State with the weights and covariances of the components' shares of the mass, and the means of sharper ones."""
     if readout.exponent == readout.mean_exponent == 1:
         return params
-    size, cells = _get_chunk(params.shape[1], mass), _describe_cells(grid, mass.device)
+    size, cells = get_chunk(params.shape[1], mass), describe_cells(grid, mass.device)
     parts = zip(mass.split(size), params.split(size), strict=True)
     return torch.cat([_measure_part(*part, cells, readout.mean_exponent) for part in parts])
 
 
 def _measure_part(mass: Tensor, params: Tensor, cells: Tensor, sharpness: float) -> Tensor:
-    moments = _compute_moments(mass, params, cells)
-    share = torch.softmax(_compute_log_densities(params, cells), 1).mul_(mass[:, None])  # (S, N, C)
+    moments = compute_moments(mass, params, cells)
+    share = torch.softmax(compute_log_densities(params, cells), 1).mul_(mass[:, None])  # (S, N, C)
     sharp = (share / share.amax(-1, keepdim=True).clamp(min=1e-30)) ** sharpness
     mean = (sharp @ cells[1:3].T) / sharp.sum(-1, keepdim=True).clamp(min=1e-9)
     mean = torch.where(moments[..., 2:3] > 1e-9, mean, params[..., :2])
     return torch.cat([mean, params[..., 2:3], moments[..., 3:]], -1)
-
-
-def _get_chunk(n_max: int, mass: Tensor) -> int:
-    return max(1, CHUNK.get(mass.device.type, CHUNK["cpu"]) // (n_max * mass.shape[1]))
 
 
 def _halve(mass: Tensor, grid: tuple[int, int]) -> tuple[Tensor, tuple[int, int]]:
@@ -229,12 +199,12 @@ def _anneal(
     temperatures: tuple[float, ...], mass: Tensor, n: Tensor, n_max: int, grid: tuple[int, int], readout: ModeReadout
 ) -> Tensor:
     """State at the peaks, then fitted to the flattened mass, less and less flattened."""
-    params, cells = _start(mass, n, n_max, grid), _describe_cells(grid, mass.device)
+    params, cells = _start(mass, n, n_max, grid), describe_cells(grid, mass.device)
     for temperature in temperatures:
         flat = mass ** (1 / temperature)
         flat /= flat.sum(-1, keepdim=True)
         for _ in range(ANNEALING_CYCLES):
-            params = _run_cycle(flat, params, cells, readout)
+            params = run_cycle(flat, params, cells, readout)
     return params
 
 
@@ -279,102 +249,12 @@ def _make_kernel(count: int, device: torch.device) -> Tensor:
     return torch.exp(-0.5 * ((at[:, None] - at) / KERNEL_CELLS) ** 2)
 
 
-def _describe_cells(grid: tuple[int, int], device: torch.device) -> Tensor:
-    """(6, C): 1, x, y, x², xy, y² of each cell, in which log-densities are linear and whose means are moments."""
-    y, x = (torch.arange(count, dtype=torch.float32, device=device) - (count - 1) / 2 for count in grid)
-    x, y = (t.flatten() for t in torch.meshgrid(x, y, indexing="xy"))
-    return torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y])
-
-
-def _run_em(mass: Tensor, params: Tensor, cells: Tensor, readout: ModeReadout) -> Tensor:
-    """Iterate until at rest; then the moments of each component's share of the mass, without the priors."""
-    size, moving = _get_chunk(params.shape[1], mass), torch.arange(len(mass), device=mass.device)
-    for _ in range(CYCLES):
-        moved = []
-        for part in moving.split(size):
-            after = _run_cycle(mass[part], params[part], cells, readout)
-            moved.append((after - params[part])[..., :2].abs().amax((1, 2)) > TOLERANCE_CELLS)
-            params[part] = after
-        moving = moving[torch.cat(moved)]
-        if not len(moving):
-            break
-    parts = zip(mass.split(size), params.split(size), strict=True)
-    present, params = params[..., 2] > 0, torch.cat([_compute_moments(*part, cells) for part in parts])
-    params[..., 2] = torch.where(present, params[..., 2].clamp(min=1e-9), 0)  # 0 stays the mark of an absent one
-    return params
-
-
-def _run_cycle(mass: Tensor, params: Tensor, cells: Tensor, readout: ModeReadout) -> Tensor:
-    """Two EM steps, a leap as far as their change of pace suggests, and a step that steadies it."""
-    first = _step(mass, params, cells, readout)
-    second = _step(mass, first, cells, readout)
-    pace, change = first - params, second - 2 * first + params
-    length = pace.flatten(1).norm(dim=1) / change.flatten(1).norm(dim=1).clamp(min=1e-12)
-    length = length.clamp(1, LEAP)[:, None, None]
-    leapt = params + 2 * length * pace + length**2 * change
-    weight, a, b, c = leapt[..., 2:].unbind(-1)
-    lawful = (a > MIN_VARIANCE) & (c > MIN_VARIANCE) & (a * c - b * b > MIN_VARIANCE**2) & (weight >= 0)
-    return _step(mass, torch.where(lawful.all(1)[:, None, None], leapt, second), cells, readout)
-
-
-def _step(mass: Tensor, params: Tensor, cells: Tensor, readout: ModeReadout) -> Tensor:
-    """One step of EM with the priors."""
-    mean, weight, covariance = _compute_moments(mass, params, cells).split([2, 1, 3], -1)
-    each = covariance[..., ::2].mean(-1)  # (S, N)
-    if readout.median_width:
-        width = each.masked_fill(params[..., 2] == 0, torch.nan).nanquantile(0.5, 1)  # (S,)
-    else:
-        width = (weight[..., 0] * each).sum(1) / weight.sum((1, 2))
-    average = width[:, None, None] * width.new_tensor([1.0, 0.0, 1.0])
-    prior = readout.shape_prior
-    covariance = (weight * covariance + prior * average) / (weight + prior)
-    weight = (weight + PRIOR_WEIGHT) * (params[..., 2:3] > 0)
-    return torch.cat([mean, weight / weight.sum(1, keepdim=True), covariance], -1)
-
-
-def _compute_moments(mass: Tensor, params: Tensor, cells: Tensor) -> Tensor:
-    """Parameters of the components' shares of the (S, C) mass: an E-step and an M-step."""
-    share = torch.softmax(_compute_log_densities(params, cells), 1).mul_(mass[:, None])  # (S, N, C)
-    moments = share @ cells.T  # (S, N, 6)
-    weight = moments[..., :1]
-    mean, (xx, xy, yy) = moments[..., 1:3] / weight.clamp(min=1e-9), moments[..., 3:].unbind(-1)
-    mean = torch.where(weight > 1e-9, mean, params[..., :2])
-    x, y = mean.unbind(-1)
-    count = weight[..., 0].clamp(min=1e-9)
-    a, b, c = xx / count - x * x, xy / count - x * y, yy / count - y * y
-    covariance = torch.stack([a.clamp(min=MIN_VARIANCE) + 1e-3, b, c.clamp(min=MIN_VARIANCE) + 1e-3], -1)
-    covariance = torch.where(weight > 1e-9, covariance, params[..., 3:])
-    return torch.cat([mean, weight, covariance], -1)
-
-
-def _compute_log_densities(params: Tensor, cells: Tensor) -> Tensor:
-    """ln(weight * density) of each component at each cell, (S, N, C), less the constant ln 2π."""
-    x, y, weight, a, b, c = params.unbind(-1)
-    determinant = a * c - b * b
-    p, q, r = c / determinant, -b / determinant, a / determinant  # the inverse covariance [[p, q], [q, r]]
-    at_origin = weight.log() - 0.5 * determinant.log() - 0.5 * (p * x * x + 2 * q * x * y + r * y * y)
-    at_origin = at_origin.clamp(min=-1e30)  # of a component that is not there; -inf times 0 would be NaN
-    return torch.stack([at_origin, p * x + q * y, q * x + r * y, -0.5 * p, -q, -0.5 * r], -1) @ cells
-
-
-def _compute_log_likelihood(mass: Tensor, params: Tensor, cells: Tensor, *, even: float = 0.0) -> Tensor:
-    """Mean log-density (S,) of the mass, each component wider by a cell's own spread: no spike between cells counts.
-
-    The mixture may have a further part that is ``even`` over the grid.
-    """
-    params = params + 2 * SPREAD[0] * params.new_tensor([0, 0, 0, 1, 0, 1])
-    size = _get_chunk(params.shape[1], mass)
-    parts = zip(mass.split(size), params.split(size), strict=True)
-    floor = mass.new_tensor(2 * math.pi * even / mass.shape[1]).log()
-    return torch.cat([(_compute_log_densities(s, cells).logsumexp(1).logaddexp(floor) * m).sum(-1) for m, s in parts])
-
-
 def _choose_fit(mass: Tensor, grid: tuple[int, int], readout: ModeReadout) -> Tensor:
     """State (S, 8, 6) with as many components as the Bayesian information criterion prefers."""
-    cells, states, criteria = _describe_cells(grid, mass.device), [], []
+    cells, states, criteria = describe_cells(grid, mass.device), [], []
     for n in range(1, MOST_MODES + 1):
         params = _fit(mass, torch.full((len(mass),), n, device=mass.device), n, grid, readout)
-        likelihood = SAMPLES * _compute_log_likelihood(mass, params, cells)
+        likelihood = SAMPLES * compute_log_likelihood(mass, params, cells)
         criteria.append((6 * n - 1) * float(np.log(SAMPLES)) - 2 * likelihood)
         states.append(F.pad(params, (0, 0, 0, MOST_MODES - n)))
     best = torch.stack(criteria).argmin(0)  # (S,)
@@ -383,7 +263,7 @@ def _choose_fit(mass: Tensor, grid: tuple[int, int], readout: ModeReadout) -> Te
 
 def _measure_outliers(mass: Tensor, params: Tensor, grid: tuple[int, int]) -> Tensor:
     """Mass (S,) outside every component's 95 % ellipse."""
-    x, y = _describe_cells(grid, mass.device)[1:3]
+    x, y = describe_cells(grid, mass.device)[1:3]
     outlier_mass = torch.ones_like(mass, dtype=torch.bool)
     for component in params.unbind(1):
         mean_x, mean_y, weight, a, b, c = component[..., None].unbind(1)  # (S, 1) each

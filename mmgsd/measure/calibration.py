@@ -4,7 +4,7 @@
     python -m mmgsd calibrate WEIGHTS --unseen FOLDER …     by images of other simulations, how modes are read as well
 
 The tables of a `Calibration` are read from all pairs; its errors are those of each half by the tables of the other.
-A reading (`mmgsd.match.mixture.ModeReadout`) counts by what a robot can grasp: `mmgsd.measure.photographs` asks the
+A reading (`mmgsd.match.em.ModeReadout`) counts by what a robot can grasp: `mmgsd.measure.photographs` asks the
 same of photographs, which choose nothing.
 """
 
@@ -24,9 +24,10 @@ from torch import Tensor
 from mmgsd.checks import read_count, read_flag
 from mmgsd.config import EvaluateConfig
 from mmgsd.dataset import Dataset, hold_out, join_datasets, load_dataset, load_parts
+from mmgsd.match.em import ModeReadout
 from mmgsd.match.match import RADIUS_PX
 from mmgsd.match.matcher import Matcher
-from mmgsd.match.mixture import ModeReadout, fit_modes
+from mmgsd.match.mixture import fit_modes
 from mmgsd.measure import uncertainty
 from mmgsd.measure.metrics import compute_query_errors
 from mmgsd.measure.questions import BATCH, ask, choose_points, describe, draw_pairs, measure_mean_error, model_answer

@@ -19,10 +19,11 @@ from mmgsd.dataset import Dataset, load_dataset
 from mmgsd.dataset_format import UNREADABLE
 from mmgsd.files import DamagedFileError, atomic_write, is_kept, read_json, saying_what_stays, write_json
 from mmgsd.match.baselines import BASELINES, EXTRACTORS, OPTIONAL, BaselineMatcher, FeatureMatcher
+from mmgsd.match.em import AS_IT_IS, ModeReadout
 from mmgsd.match.features import Extractor
 from mmgsd.match.heatmap import check_scales, read_heatmap
 from mmgsd.match.matcher import Matcher
-from mmgsd.match.mixture import AS_IT_IS, Mixture, ModeReadout, check_modes
+from mmgsd.match.mixture import Mixture, check_modes
 from mmgsd.measure.metrics import aggregate
 from mmgsd.measure.questions import AnswerFunction, ask, model_answer
 

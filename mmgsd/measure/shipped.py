@@ -28,10 +28,10 @@ from mmgsd.dataset_format import SPLITS
 from mmgsd.files import DamagedFileError, read_json
 from mmgsd.images import read_image
 from mmgsd.match.baselines import BaselineMatcher, FeatureMatcher
+from mmgsd.match.em import AS_IT_IS, ModeReadout
 from mmgsd.match.heatmap import read_heatmap
 from mmgsd.match.match import RADIUS_PX, Match
 from mmgsd.match.matcher import Matcher, find_weights
-from mmgsd.match.mixture import AS_IT_IS, ModeReadout
 from mmgsd.match.places import NAMES
 from mmgsd.measure import uncertainty
 from mmgsd.measure.evaluation import evaluate_baseline, evaluate_model, load_queries

@@ -21,10 +21,11 @@ from torch.nn.utils.rnn import pad_sequence
 
 from mmgsd.config import EvaluateConfig
 from mmgsd.dataset import Dataset
+from mmgsd.match.em import AS_IT_IS
 from mmgsd.match.heatmap import read_heatmap
 from mmgsd.match.joint import join, predict, spread_places
 from mmgsd.match.matcher import QUARTERS, Matcher
-from mmgsd.match.mixture import AS_IT_IS, Mixture, find_peaks
+from mmgsd.match.mixture import Mixture, find_peaks
 from mmgsd.measure.metrics import aggregate
 from mmgsd.measure.questions import AnswerFunction, ask, choose_points, draw_pairs
 from mmgsd.model.heads import Outputs

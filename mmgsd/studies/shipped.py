@@ -9,7 +9,7 @@
 A row a name: of weights in data/weights; of a baseline, which is asked about each object with the true masks, and in
 photographs with those that the shipped weights see, and whose modes are read as theirs; or of each model of a study of
 `STUDIES` of the preset `paper`, or of another with so many steps each (--preset quick --steps 300), which is asked
-about that preset's images. How modes are read (`mmgsd.match.mixture.ModeReadout`) is the weights' own, unless the name
+about that preset's images. How modes are read (`mmgsd.match.em.ModeReadout`) is the weights' own, unless the name
 says another after an @. The test images of the presets `paper` and `workspace`, or of that one, have to be rendered,
 unless --photographs-alone leaves them out: what a row has of the same weights stays. Tables of answers are kept, so
 that a killed call goes on.

@@ -23,9 +23,9 @@ from sklearn.mixture import GaussianMixture
 from mmgsd.command import run_command
 from mmgsd.config import ROUNDNESS, load_preset
 from mmgsd.dataset import load_dataset, sample_pairs
+from mmgsd.match.em import PRIOR_WEIGHT
 from mmgsd.match.heatmap import read_heatmap
 from mmgsd.match.matcher import Matcher
-from mmgsd.match.mixture import PRIOR_WEIGHT
 from mmgsd.measure.metrics import compute_mode_errors
 from mmgsd.model.network import compute_cell_centres
 from mmgsd.model.tensors import WEIGHTS

@@ -20,8 +20,9 @@ import mmgsd
 from mmgsd.extras import page as page_module
 from mmgsd.extras.page import LICENCES, PACKAGE, RUNTIME, describe_mixture, make_page
 from mmgsd.files import ForeignFileError
+from mmgsd.match.em import ModeReadout
 from mmgsd.match.matcher import Matcher
-from mmgsd.match.mixture import ModeReadout, fit_modes
+from mmgsd.match.mixture import fit_modes
 from mmgsd.paths import find_samples
 
 in_browser = pytest.mark.skipif(CHROMIUM is None, reason="needs the program chromium")

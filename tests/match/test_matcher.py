@@ -17,9 +17,10 @@ from mmgsd.dataset import load_dataset
 from mmgsd.match import heatmap as heatmaps_of
 from mmgsd.match import matcher as matching
 from mmgsd.match.baselines import BaselineMatcher
+from mmgsd.match.em import ModeReadout
 from mmgsd.match.heatmap import compute_entropy, compute_heatmap, make_match, read_heatmap
 from mmgsd.match.matcher import Matcher, load
-from mmgsd.match.mixture import Mixture, ModeReadout
+from mmgsd.match.mixture import Mixture
 from mmgsd.measure.metrics import compute_query_errors
 from mmgsd.model.heads import Outputs
 from mmgsd.model.network import build_network, compute_cell_centres

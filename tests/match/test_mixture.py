@@ -10,8 +10,9 @@ from heatmaps import CELL_PX, CELLS, CORNERS, XS, YS, draw_mixture, one_cell
 from sklearn.mixture import GaussianMixture
 from torch import Tensor
 
-from mmgsd.match import mixture
-from mmgsd.match.mixture import ModeReadout, find_peaks, fit_modes
+from mmgsd.match import em, mixture
+from mmgsd.match.em import ModeReadout
+from mmgsd.match.mixture import find_peaks, fit_modes
 from mmgsd.measure.metrics import compute_mode_errors
 from mmgsd.model.network import compute_cell_centres
 
@@ -220,7 +221,7 @@ def test_queries_do_not_disturb_each_other() -> None:
 def test_chunks_do_not_change_the_answer(monkeypatch: pytest.MonkeyPatch) -> None:
     heatmaps = draw_overlapping(2.0)[1]
     whole = fit_modes(heatmaps, 2, XS, YS)
-    monkeypatch.setitem(mixture.CHUNK, "cpu", 2 * 5 * CELLS**2)  # five queries at a time
+    monkeypatch.setitem(em.CHUNK, "cpu", 2 * 5 * CELLS**2)  # five queries at a time
     parts = fit_modes(heatmaps, 2, XS, YS)
     assert compute_mode_errors(parts.modes.numpy(), whole.modes.numpy()).max() < 0.01  # equal ones in any order
 

@@ -14,8 +14,8 @@ from safetensors import safe_open
 
 from mmgsd.config import TrainConfig
 from mmgsd.dataset import load_dataset
+from mmgsd.match.em import ModeReadout
 from mmgsd.match.matcher import Matcher
-from mmgsd.match.mixture import ModeReadout
 from mmgsd.measure import calibration
 from mmgsd.measure.calibration import (
     BANDWIDTHS,

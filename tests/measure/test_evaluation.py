@@ -14,8 +14,9 @@ import torch
 
 from mmgsd.config import EvaluateConfig, TrainConfig
 from mmgsd.dataset import Dataset, load_dataset
+from mmgsd.match.em import AS_IT_IS, ModeReadout
 from mmgsd.match.matcher import Matcher
-from mmgsd.match.mixture import AS_IT_IS, Mixture, ModeReadout
+from mmgsd.match.mixture import Mixture
 from mmgsd.measure import evaluation, questions
 from mmgsd.measure.evaluation import (
     BASELINES,

@@ -10,8 +10,8 @@ import torch
 
 from mmgsd.config import EvaluateConfig, TrainConfig
 from mmgsd.dataset import load_dataset
+from mmgsd.match.em import ModeReadout
 from mmgsd.match.matcher import Matcher
-from mmgsd.match.mixture import ModeReadout
 from mmgsd.measure import calibration
 from mmgsd.measure.calibration import (
     ALLOWED,
