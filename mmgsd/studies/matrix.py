@@ -287,10 +287,10 @@ def write_main_table(preset: Preset, root: Path) -> dict[str, dict[str, dict]]:
 
 
 def _find_row(paths: Paths, key: str, model: TrainConfig | None, row: dict, run: dict) -> tuple[dict, dict]:
-    """Results and cost of a model, or of the baseline ``key``: those of its answers, or else what is stored."""
-    out = paths.queries(model.name if model else key)
-    if out.is_file():
-        return evaluation.summarise({key: out})[key], describe_run(paths.model(model) / WEIGHTS) if model else {}
+    """Results and cost of a model, or of the baseline ``key``: of its answers and weights, or else what is stored."""
+    out, weights = paths.queries(model.name if model else key), paths.model(model) / WEIGHTS if model else None
+    if out.is_file() and (weights is None or weights.is_file()):  # answers alone do not say what they cost
+        return evaluation.summarise({key: out})[key], describe_run(weights) if weights else {}
     return (row, run) if model is None or run.get("model") == model.name else ({}, {})
 
 
