@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -18,6 +19,8 @@ from mmgsd.model import dinov2
 from mmgsd.model.tensors import write_tensors
 
 os.environ.setdefault("MPLBACKEND", "Agg")  # no window, and before anything imports matplotlib
+
+gc.set_threshold(100_000, 50, 50)  # thousands of tests are many objects, which are looked through again and again
 
 hypothesis.settings.register_profile("reproducible", derandomize=True, deadline=None, max_examples=50)
 hypothesis.settings.load_profile("reproducible")
