@@ -4,8 +4,8 @@
     python -m mmgsd run cells --preset paper          -> data/results/paper/cells.json; a killed call goes on
 
 A cell of the main table's heatmaps is 15 px wide: targets with a σ of 1, 2 and 4 px hardly differ there. Here the
-trained MMGSD takes more steps with inputs of about the images' own size, where cells are 4 px wide; and as many steps
-with its own inputs, to compare with.
+trained MMGSD goes on with larger and larger inputs, to about the images' own size, where cells are 4 px wide, and from
+there with each σ. As many steps with its own inputs are there to compare with.
 """
 
 from __future__ import annotations
@@ -25,56 +25,69 @@ from mmgsd.model.tensors import WEIGHTS, describe_run
 from mmgsd.paths import Paths
 from mmgsd.studies.claims import Claim, get, is_better, say
 from mmgsd.studies.matrix import list_missing, measure_each
-from mmgsd.studies.models import ITS_OWN, Model, by_object, configure_study, times
+from mmgsd.studies.models import ITS_OWN, ROWS, Model, configure_study, list_rows, times
 from mmgsd.studies.parameters import check_images, choose_objects
 from mmgsd.studies.registry import Results, Shown, Study
 from mmgsd.studies.table import Column, Table, collect_rows
 
 WIDTHS_PX = (1.0, 2.0, 4.0, 8.0)  # σ
-START, COARSE = "start", "coarse"
+GROWN = [row.name for row in list_rows("cells")]  # each goes on from the one before
+LAST_STEPS = 0.4  # of the steps of those before, with each σ
 PAIRS, POINTS = 100, 65  # at most, of images and of points a pair: fine heatmaps take long to ask
-# half a batch, for the memory that large images take
-MORE = {"trunk_weights": ITS_OWN, "steps": times(0.1), "learning_rate": times(0.5), "batch": times(0.5),
-        "pairs": times(0.5), "sigma_start_px": 8.0, "prototype_weight": 0.0}  # fmt: skip
-ROWS = (
-    Model(START, "cells of 15 px, as trained", "mmgsd"),
-    Model(COARSE, "the same, a tenth of the steps more", "mmgsd", MORE),
-    *(Model(f"{s:g}", f"then cells of 4 px, σ = {s:g} px", "mmgsd",
-            {**MORE, "input_px": by_object(cloth=480, rope=640), "sigma_px": s}) for s in WIDTHS_PX),
+# the other models' steps after the trained one, at its own size
+COARSE = {**ROWS[GROWN[0]].changes, "input_px": times(1), "sigma_px": 1.0,
+          "steps": times(0.25 * (len(GROWN) + LAST_STEPS))}  # fmt: skip
+SHOWN = (
+    Model("start", "cells of 15 px, as trained", "mmgsd"),
+    Model("coarse", "the same, longer", "mmgsd", COARSE),
+    *(ROWS[name] for name in GROWN),
+    *(Model(f"{width:g}", f"then σ = {width:g} px", GROWN[-1],
+            {"trunk_weights": ITS_OWN, "steps": times(LAST_STEPS), "learning_rate": times(0.5), "sigma_px": width})
+      for width in WIDTHS_PX),
 )  # fmt: skip
 
 
 def list_models(preset: str, object: str) -> dict[str, TrainConfig]:
-    """{"start", "coarse", or σ (px): training} of an object."""
-    return configure_study(load_preset(preset), object, "cells", ROWS)
+    """{"start", "coarse", those of `GROWN`, or σ (px): training} of an object."""
+    return configure_study(load_preset(preset), object, "cells", SHOWN)
 
 
 def check(paths: Paths, *, objects: str | Sequence[str] = OBJECTS) -> None:
     """ValueError for other objects, FileNotFoundError where their images or the models to start from are missing."""
     for name in choose_objects(objects):
+        models = list_models(paths.preset, name)
         check_images(paths, [name], split="train")
-        check_start(list_models(paths.preset, name)[COARSE], paths.model(list_models(paths.preset, name)[START]).parent)
+        check_start(models["coarse"], paths.model(models["start"]).parent)
 
 
 def run(paths: Paths, *, objects: str | Sequence[str] = OBJECTS) -> Path:
-    """Train and ask each model of the objects, one after another; cells.json.
+    """Train and ask each model of the objects: cells.json.
 
     A row that is stored of the same training is kept.
     """
     file = paths.results / "cells.json"
     for name in choose_objects(objects):
-        models = list_missing(list_models(paths.preset, name), file, [name])
-        measure_each(models, file, [name], partial(_measure, paths=paths), desc=name)
+        models = list_models(paths.preset, name)
+        missing = list_missing(models, file, [name])
+        for key in GROWN if missing else ():  # what the others go on from
+            _train(models[key], paths, progress=True)
+        measure_each(missing, file, [name], partial(_measure, paths=paths), desc=name)
     return file
 
 
+def _train(model: TrainConfig, paths: Paths, *, progress: bool) -> Path:
+    """Its weights, which may be restored ones, of fewer digits than training leaves."""
+    weights = paths.model(model) / WEIGHTS
+    if weights.is_file():
+        return weights
+    return train_model(model, paths.dataset(model.object), paths.model(model), progress=progress)
+
+
 def _measure(model: TrainConfig, *, paths: Paths, progress: bool) -> dict[str, Any]:
-    """The errors of a model, how wide (px) its modes and its cells are, and what its training took."""
+    """The errors of a model, how wide (px) its modes are, and what its training took."""
     data, questions = paths.dataset(model.object), load_preset(paths.preset).evaluate
     fewer = dataclasses.replace(questions, pairs=min(PAIRS, questions.pairs), points=min(POINTS, questions.points))
-    weights = paths.model(model) / WEIGHTS
-    if not weights.is_file():
-        weights = train_model(model, data, paths.model(model), progress=progress)
+    weights = _train(model, paths, progress=progress)
     table = evaluate_model(weights, data, fewer, paths.queries(f"{model.name}-cells"), progress=progress)
     widths = load_queries(table).spread_px.explode().to_numpy(float)
     return summarise({"": table})[""] | {"width_px": float(np.median(widths)), "run": describe_run(weights)}
@@ -85,7 +98,7 @@ def describe_cells(results: Results) -> Table:
     columns = [Column("rmse_mean", page="RMSE px"), Column("median", page="median px"),
                Column("pck@5px", page="pck@5px", form=".0f", scale=100),
                Column("width_px", page="modes' σ px")]  # fmt: skip
-    return Table("", {"": columns}, collect_rows(results, {row.name: row.label for row in ROWS}), OBJECTS)
+    return Table("", {"": columns}, collect_rows(results, {row.name: row.label for row in SHOWN}), OBJECTS)
 
 
 def judge_cells(results: Results) -> Claim:

@@ -129,6 +129,13 @@ MODELS = (
             "MMGSD, shipped" * (n == ROUNDS["cloth"]), "#A6761D",
             tuple(object for object in OBJECTS if n <= ROUNDS[object]))
       for n in range(2, max(ROUNDS.values()) + 1)),
+    # images grow to about their own size, cells shrink from 15 px; half a batch, for the memory that this takes
+    Model("mmgsd_larger", "then cells of 8 px", "mmgsd",
+          {"trunk_weights": ITS_OWN, "input_px": times(2), "steps": times(0.25), "batch": times(0.5),
+           "pairs": times(0.5), "learning_rate": times(0.5), "sigma_px": 8.0, "sigma_start_px": 8.0,
+           "prototype_weight": 0.0}, ("cells",)),
+    Model("mmgsd_largest", "then cells of 4 px", "mmgsd_larger",
+          {"trunk_weights": ITS_OWN, "input_px": by_object(cloth=480, rope=640)}, ("cells",)),
     # what each part of the shipped models' training brings, one after another
     Model("mmgsd_workspace", "MMGSD, workspace renders too", "mmgsd", {"also": "workspace"}, ("robustness",),
           "+ workspace"),

@@ -14,27 +14,31 @@ from mmgsd.measure.evaluation import read_results
 from mmgsd.paths import Paths
 from mmgsd.studies import cells, matrix
 from mmgsd.studies.claims import HELD, IN_PART, NOT_HELD, NOT_MEASURED
+from mmgsd.studies.models import ITS_OWN
 from mmgsd.studies.table import to_markdown
 
 
 @pytest.mark.parametrize("name", OBJECTS)
-def test_all_widths_go_on_from_the_trained_model_at_cells_of_four_px(name: str) -> None:
+def test_images_grow_and_all_widths_go_on_from_the_largest(name: str) -> None:
     models = cells.list_models("paper", name)
-    start, coarse, *fine = models.values()
-    assert {model.trunk_weights for model in (coarse, *fine)} == {start.name}
-    assert len({(m.steps, m.batch, m.pairs, m.learning_rate, m.prototype_weight) for m in (coarse, *fine)}) == 1
-    assert [model.sigma_px for model in fine] == list(cells.WIDTHS_PX) and coarse.sigma_px == 1
+    start, coarse, larger, largest, *fine = models.values()
+    assert [model.trunk_weights for model in (coarse, larger, largest)] == [start.name, start.name, larger.name]
+    assert {model.trunk_weights for model in fine} == {largest.name}
     longer = max(load_preset("paper").render[name].size)
-    assert 14 < longer / (coarse.input_px / 4) < 17  # px of a cell
-    assert all(4 <= longer / (model.input_px / 4) < 4.1 for model in fine)
+    widths = [longer / (model.input_px / 4) for model in (coarse, larger, largest, *fine)]  # px of a cell
+    assert 14 < widths[0] < 17 and 7 < widths[1] < 9 and all(4 <= width < 4.1 for width in widths[2:])
+    assert [model.sigma_px for model in fine] == list(cells.WIDTHS_PX) and coarse.sigma_px == 1
+    assert {coarse.steps} == {larger.steps + largest.steps + one.steps for one in fine}
+    assert len({(m.batch, m.pairs, m.prototype_weight) for m in (coarse, larger, largest, *fine)}) == 1
 
 
 def test_run_goes_on_from_the_start_asks_all_and_keeps_what_is_stored(
     tmp_path: Path, tiny_dataset: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(matrix, "PROCESSES", 1)  # other processes would not see what is replaced here
-    small = dict(cells.ROWS[-1].changes, input_px=96)
-    monkeypatch.setattr(cells, "ROWS", (*cells.ROWS[:2], dataclasses.replace(cells.ROWS[2], changes=small)))
+    small = dataclasses.replace(cells.ROWS["mmgsd_largest"], changes={"trunk_weights": ITS_OWN, "input_px": 96})
+    monkeypatch.setitem(cells.ROWS, "mmgsd_largest", small)
+    monkeypatch.setattr(cells, "SHOWN", (*cells.SHOWN[:3], small, cells.SHOWN[4]))
     paths = Paths(tmp_path, "smoke")
     with pytest.raises(ValueError, match="run 01_render_data"):
         cells.check(paths, objects="cloth")
@@ -48,9 +52,9 @@ def test_run_goes_on_from_the_start_asks_all_and_keeps_what_is_stored(
     cells.check(paths, objects="cloth")
     file = cells.run(paths, objects="cloth")
     rows = read_results(file, depth=2)["cloth"]
-    assert list(rows) == ["start", "coarse", "1"] and rows["start"]["run"]["steps"] == start.steps
-    assert rows["1"]["width_px"] > 0
-    monkeypatch.setattr(cells, "_measure", lambda *_, **__: pytest.fail("asked again"))
+    assert list(rows) == ["start", "coarse", "mmgsd_larger", "mmgsd_largest", "1"]
+    assert rows["start"]["run"]["steps"] == start.steps and rows["1"]["width_px"] > 0
+    monkeypatch.setattr(cells, "_train", lambda *_, **__: pytest.fail("trained again"))
     cells.run(paths, objects="cloth")
 
 
@@ -72,5 +76,5 @@ def test_the_least_width_has_to_be_better_than_each_wider_one(errors: dict, verd
 def test_the_table_has_a_line_for_each_that_was_measured() -> None:
     row = {"rmse_mean": 20.0, "median": 12.0, "pck@5px": 0.3, "width_px": 6.0}
     lines = to_markdown(cells.describe_cells({"cloth": {"start": row, "1": row}})).splitlines()
-    assert "| then cells of 4 px, σ = 1 px | 20.0 | 12.0 | 30 % | 6.0 | – | – | – | – |" in lines
+    assert "| then σ = 1 px | 20.0 | 12.0 | 30 % | 6.0 | – | – | – | – |" in lines
     assert len([line for line in lines if "20.0" in line]) == 2

@@ -109,7 +109,7 @@ def test_every_row_comes_to_a_training_of_its_objects(preset: str) -> None:
 def test_names_are_unique_and_starts_are_rows() -> None:
     assert len(ROWS) == len(MODELS) + len(UNTRAINED)
     assert {row.start for row in MODELS} <= {PRESET, *ROWS}
-    others = {"fixes", "robustness", "rounds", "seeds"}
+    others = {"cells", "fixes", "robustness", "rounds", "seeds"}
     assert {study for row in MODELS for study in row.studies} | {"sigma"} == {*STUDIES, *others}
 
 
