@@ -63,10 +63,11 @@ def _run(words: list[str]) -> None:
     if place.startswith("cli."):
         note = _describe_outputs(options)
         os.environ["MPLBACKEND"] = "Agg"  # another environment's, such as a notebook's, may be missing in this one
-    run_command(functools.partial(call, _load(place), options), kept=note)
+    run_command(functools.partial(call, load_function(place), options), kept=note)
 
 
-def _load(place: str) -> Callable[..., None]:
+def load_function(place: str) -> Callable[..., None]:
+    """What a command calls, from its place in `COMMANDS` or `STUDIES`."""
     place, _, study = place.partition(":")
     module, _, name = place.rpartition(".")
     function = getattr(importlib.import_module(f"mmgsd.{module}"), name)
@@ -103,7 +104,7 @@ def _add_commands(commands: Any, table: Mapping[str, tuple[str, str]], words: li
     for name, (place, line) in table.items():
         command = commands.add_parser(name, help=line, formatter_class=argparse.RawDescriptionHelpFormatter)
         if words[:1] == [name]:
-            function = _load(place)
+            function = load_function(place)
             documented = function if place.startswith("cli.") else sys.modules[function.__module__]  # with examples
             command.description, _, command.epilog = (inspect.getdoc(documented) or "").partition("\n\n")
             add_arguments(command, function)

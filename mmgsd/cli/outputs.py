@@ -40,6 +40,7 @@ def save_picture(figure: Any, path: Path) -> None:
 
 
 def check_order(joint: bool, seen_first: bool) -> None:
+    """ValueError for two orders at once."""
     if joint and seen_first:
         raise ValueError("--seen-first must not be given with --joint, which has an order of its own")
 
@@ -64,6 +65,7 @@ def check_drawn(xy: list, how: str) -> None:
 
 
 def say_left_out(folder: Path, paths: list[Path]) -> None:
+    """Name what a folder holds besides the images that are answered."""
     names = [path.name for path in sorted({*folder.iterdir()}.difference(paths)) if not path.name.startswith(".")]
     if names:
         more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
@@ -93,6 +95,7 @@ def print_answer(name: str, described: list[dict[str, Any]], *, as_json: bool) -
 
 
 def name_place(place: Any) -> str:
+    """A place as it was given in the command: "corners", "0.5,1"."""
     return ",".join(f"{value:g}" for value in place) if isinstance(place, tuple) else f"{place}"
 
 

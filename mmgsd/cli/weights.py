@@ -8,15 +8,8 @@ from pathlib import Path
 from typing import Annotated
 
 import mmgsd
-from mmgsd.cli.arguments import (
-    Folder,
-    Picture,
-    Trained,
-    Weights,
-)
-from mmgsd.cli.outputs import (
-    save_picture,
-)
+from mmgsd.cli.arguments import Folder, Picture, Trained, Weights
+from mmgsd.cli.outputs import save_picture
 from mmgsd.command import Option
 
 

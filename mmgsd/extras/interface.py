@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
-from mmgsd.__main__ import COMMANDS
+from mmgsd.__main__ import COMMANDS, load_function
 from mmgsd.command import Option
 from mmgsd.files import write_text
 
@@ -61,9 +61,7 @@ def _list_entries(place: str) -> Iterator[tuple[str, str, str]]:
 def _list_commands() -> Iterator[tuple[str, str]]:
     for name, (place, _) in COMMANDS.items():
         if place.startswith("cli."):  # what asks weights
-            module, _, function = place.rpartition(".")
-            command = getattr(importlib.import_module(f"mmgsd.{module}"), function)
-            yield name, inspect.getdoc(command).partition("\n\n")[0]
+            yield name, inspect.getdoc(load_function(place)).partition("\n\n")[0]
 
 
 def _sign(thing: Any) -> str:

@@ -143,4 +143,5 @@ def describe_cells(grid: tuple[int, int], device: torch.device) -> Tensor:
 
 
 def get_chunk(n_max: int, mass: Tensor) -> int:
+    """How many queries of so many components, on the mass's grid, are fitted at once."""
     return max(1, CHUNK.get(mass.device.type, CHUNK["cpu"]) // (n_max * mass.shape[1]))
