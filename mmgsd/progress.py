@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 from tqdm.auto import tqdm
-from tqdm.notebook import tqdm_notebook
 
 TOLD = "MMGSD_PROGRESS"  # environment variable that names the file; without it, none is told
 EVERY = 1.0  # s, at least, between two changes of the file
@@ -36,7 +35,8 @@ class ProgressBar(tqdm):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self._last, self._last_line, self._lines = -EVERY, time.monotonic(), not _is_watched()
-        hidden = {"display": False} if issubclass(tqdm, tqdm_notebook) else {"file": Nowhere()}
+        in_notebook = getattr(sys.modules.get("tqdm.notebook"), "tqdm_notebook", ())
+        hidden = {"display": False} if issubclass(tqdm, in_notebook) else {"file": Nowhere()}
         super().__init__(*args, **kwargs, **(hidden if self._lines else {}))
 
     def display(self, *args: Any, **kwargs: Any) -> Any:

@@ -81,7 +81,10 @@ def test_what_stands_beside_the_packages_imports_none() -> None:
 @pytest.mark.parametrize(
     ("code", "without"),
     [
-        ("import mmgsd.learn.training, mmgsd.measure.calibration", ("mmgsd.match.baselines", "skimage", "matplotlib")),
+        (
+            "import mmgsd.learn.training, mmgsd.measure.calibration",
+            ("mmgsd.match.baselines", "skimage", "sklearn", "matplotlib", "ipywidgets"),
+        ),
         ("from mmgsd.studies.registry import list_studies; list_studies()", ("distributed", "bpy")),
     ],
     ids=["training and matching without baselines", "results without a cluster"],

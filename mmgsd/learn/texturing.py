@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import cv2
 import numpy as np
-from scipy.interpolate import LinearNDInterpolator
+import scipy
 from scipy.spatial import cKDTree
 
 from mmgsd.learn.compositing import crop, draw_colour, draw_things, fill_area
@@ -95,7 +95,7 @@ def _interpolate(xy: np.ndarray, flat: np.ndarray, places: np.ndarray, object: s
     _, nearest = cKDTree(xy).query(places)
     uv = flat[nearest]
     if object != "rope" and np.linalg.matrix_rank(xy - xy.mean(0), tol=1.0) == 2:
-        between = LinearNDInterpolator(xy, flat)(places)
+        between = scipy.interpolate.LinearNDInterpolator(xy, flat)(places)
         uv = np.where(np.isnan(between), uv, between)
     return uv.clip(0, 1)
 

@@ -8,8 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
-from scipy.stats import chi2, spearmanr
-from sklearn.metrics import roc_auc_score
+import scipy
 
 from mmgsd.measure.metrics import LISTS
 from mmgsd.model.calibration import LEVELS as TABLED
@@ -51,7 +50,7 @@ def compute_coverage(mahalanobis2: np.ndarray, levels: Sequence[float] = LEVELS)
     if np.isnan(mahalanobis2).all():
         return np.full(len(levels), np.nan)
     ordered = np.sort(mahalanobis2)  # NaN last
-    return np.searchsorted(ordered, chi2.ppf(levels, 2), side="right") / len(ordered)
+    return np.searchsorted(ordered, scipy.stats.chi2.ppf(levels, 2), side="right") / len(ordered)
 
 
 def compute_coverage_error(mahalanobis2: np.ndarray, levels: Sequence[float] = LEVELS) -> float:
@@ -64,6 +63,8 @@ def compute_auroc(score: np.ndarray, positive: np.ndarray) -> float:
 
     ``score`` (S,) and ``positive`` (S,) bool.
     """
+    from sklearn.metrics import roc_auc_score  # alone needs it, and waits for it
+
     if np.isnan(score).any() or len(np.unique(positive)) < 2:
         return np.nan
     return float(roc_auc_score(positive, score))
@@ -84,7 +85,7 @@ def recalibrate(queries: pd.DataFrame, calibration: Calibration | None) -> pd.Da
         return queries
     _check_lists(queries)
     rows = _explode(queries)
-    distances = chi2.ppf(calibration.compute_level(rows.mahalanobis2.to_numpy(), measure_modes(rows)), 2)
+    distances = scipy.stats.chi2.ppf(calibration.compute_level(rows.mahalanobis2.to_numpy(), measure_modes(rows)), 2)
     ends = queries.mahalanobis2.map(len).cumsum()
     return queries.assign(mahalanobis2=pd.Series(np.split(distances, ends[:-1]), queries.index, object))
 
@@ -183,7 +184,7 @@ def _summarise_risk(error: np.ndarray, entropy: np.ndarray) -> dict[str, float]:
     aurc = compute_aurc(error, entropy) if np.isfinite(entropy).all() else np.nan
     oracle, mean = compute_aurc(error, error), error.mean() if len(error) else np.nan
     return {
-        "spearman": spearmanr(entropy, error).statistic if varied else np.nan,
+        "spearman": scipy.stats.spearmanr(entropy, error).statistic if varied else np.nan,
         "aurc": aurc,
         "aurc_oracle": oracle,
         "aurc_random": mean,
