@@ -248,7 +248,7 @@ ROUND = {**PAPER, "train_images": 600, "test_images": 10}
 PRESETS = {
     "smoke": _preset(
         "smoke",
-        train_images=8, test_images=4, views={"cloth": 2, "rope": 2},
+        train_images=4, test_images=4, views={"cloth": 2, "rope": 2},
         train={"steps": 6, "batch": 4, "pairs": 6, "queries": 16, "input_px": 64}, rope={},
         ablation={"steps": 4}, sigmas=(1.0, 16.0),
         evaluate={"pairs": 4, "points": 25},

@@ -7,6 +7,7 @@ button to the first frame in which the figure's right canvas has other pixels. T
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -27,18 +28,24 @@ WATCH = """() => {
 }"""
 
 
+def time_clicks(page: Any, count: int) -> list[float]:
+    """Milliseconds of each click at random places of the explorer that a page (playwright) shows."""
+    took = []
+    for x, y in np.random.default_rng(0).uniform((0.24, 0.3), (0.76, 0.7), (count, 2)):
+        page.wait_for_timeout(300)
+        page.evaluate(WATCH)
+        click_figure(page, float(x), float(y))
+        took.append(page.evaluate("() => window.took"))
+    return took
+
+
 def main() -> None:
     """Print the median milliseconds, and the slowest tenth's."""
     if CHROMIUM is None:
         raise RuntimeError("the program chromium is not installed: the page is shown in it")
-    clicks, rng, took = int(sys.argv[1]) if len(sys.argv) > 1 else 30, np.random.default_rng(0), []
+    clicks = int(sys.argv[1]) if len(sys.argv) > 1 else 30
     with tempfile.TemporaryDirectory() as folder, run_lab(Path(folder)) as address, open_explorer(address) as page:
-        for x, y in rng.uniform((0.24, 0.3), (0.76, 0.7), (clicks + 3, 2)):
-            page.wait_for_timeout(300)
-            page.evaluate(WATCH)
-            click_figure(page, float(x), float(y))
-            took.append(page.evaluate("() => window.took"))
-    took = took[3:]  # the first ones compute the descriptors of the pair
+        took = time_clicks(page, clicks + 3)[3:]  # the first ones compute the descriptors of the pair
     half, most = np.quantile(took, (0.5, 0.9))
     print(f"{half:.0f} ms from click to picture, {most:.0f} ms or less in 90 % of {clicks}")
 

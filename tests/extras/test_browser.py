@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import importlib
 import io
 import json
 from collections.abc import Iterator
@@ -320,6 +321,12 @@ def test_a_click_changes_the_picture(page: Any) -> None:
     first = look(page)
     ask(page, 0.6, 0.6)
     assert changed(start, first) > 0.01 and changed(first, look(page)) > 0.01
+
+
+def test_the_bench_times_clicks(page: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(ROOT / "tests" / "bench")
+    took = importlib.import_module("bench_explorer").time_clicks(page, 2)
+    assert len(took) == 2 and min(took) > 0
 
 
 @pytest.mark.parametrize("names", [("next", "next"), ("random", "random"), ("previous", "previous")])

@@ -6,6 +6,7 @@ import dataclasses
 import json
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pandas as pd
@@ -105,14 +106,16 @@ def test_a_stopped_run_ends_with_the_same_weights(
 
 
 def test_what_was_done_of_other_photographs_is_not_gone_on_with(
-    photographs: Path, weights: Path, cloth_dataset: Path, tmp_path: Path
+    photographs: Path, weights: Path, cloth_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     work = tmp_path / "mine.adapting"
     (work / "part0").mkdir(parents=True)
     (work / "asked.json").write_text("{}")
     (work / "part0" / "after-4.json").write_text("[]")
-    go_on(photographs, weights, cloth_dataset, tmp_path / "mine.safetensors", folds=2)
-    assert not work.exists()
+    monkeypatch.setattr(adapting, "make_batch", Mock(side_effect=KeyboardInterrupt))  # before the first step
+    with pytest.raises(KeyboardInterrupt):
+        go_on(photographs, weights, cloth_dataset, tmp_path / "mine.safetensors", folds=2)
+    assert (work / "asked.json").read_text() != "{}" and not (work / "part0" / "after-4.json").exists()
 
 
 def test_what_cannot_be_learnt_from_is_said(

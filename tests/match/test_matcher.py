@@ -282,18 +282,18 @@ def measure_sample(name: str, size: tuple[int, int]) -> float:
     centres = [np.ptp(xy[seen], 0) / 2 + xy[seen].min(0) for xy, seen in zip(data.xy, data.visible, strict=True)]
     corners = [np.clip(c - size / 2, 0, np.array(data.size) - size).astype(int) for c in centres]
     crops = [data.load_image(k)[y : y + size[1], x : x + size[0]] for k, (x, y) in enumerate(corners)]
-    pairs = [matcher.prepare(crops[k], crops[(k + step) % len(crops)]) for step in (1, 3) for k in range(len(crops))]
-    for number, pair in enumerate(pairs):
-        first = number % len(crops)
-        second = (first + (1, 3)[number // len(crops)]) % len(crops)
+    questions, matches = [], []
+    for first, second in ((k, (k + step) % len(crops)) for step in (1, 3) for k in range(len(crops))):
         xy = data.xy[first, points] - corners[first]
         true = data.xy[second][group.permutations[:, points].T] - corners[second]  # (S, G, 2)
         inside = ((true >= 0) & (true < size - 1)).all((1, 2)) & ((xy >= 0) & (xy < size - 1)).all(1)
         asked = inside & data.visible[first, points]
-        cells = torch.from_numpy(pair.match(xy[asked]).cells)
+        questions.append((crops[first], crops[second], xy[asked]))
+        matches.append(true[asked])
+    for match, true in zip(matcher.match_many(questions), matches, strict=True):
+        cells = torch.from_numpy(match.cells)
         fit, _ = read_heatmap(cells, len(group.permutations), compute_cell_centres(tuple(size), cells.shape[1:]))
-        modes, covariances = fit.modes.numpy(), fit.covariances.numpy()
-        pair_errors.append(compute_query_errors(modes, covariances, true[asked])["rmse_px"])
+        pair_errors.append(compute_query_errors(fit.modes.numpy(), fit.covariances.numpy(), true)["rmse_px"])
     return float(np.concatenate(pair_errors).mean())
 
 

@@ -163,13 +163,14 @@ def _choose_orbits(candidates: np.ndarray, transforms: list[np.ndarray]) -> np.n
     """Candidates (N, 3) in order with all that they are moved to, but for orbits too near to what is there."""
     chosen = np.empty((0, 3))
     for candidate in candidates:
+        if np.linalg.norm(chosen - candidate, axis=1).min(initial=np.inf) <= 0.55 * SPACING:  # as near as all its orbit
+            continue
         moved = np.stack([t @ candidate for t in transforms])
         distance = np.linalg.norm(moved[:, None] - moved[None], axis=-1)
         first = np.array([not (distance[i, :i] < 1e-6).any() for i in range(len(moved))])  # a fixed point counts once
         orbit = moved[first]
         gaps = distance[np.ix_(first, first)] + np.eye(len(orbit))
-        others = np.linalg.norm(chosen[:, None] - orbit[None], axis=-1)
-        if min(gaps.min(), others.min(initial=np.inf)) > 0.55 * SPACING:
+        if gaps.min() > 0.55 * SPACING:
             chosen = np.concatenate([chosen, orbit])
     return chosen
 

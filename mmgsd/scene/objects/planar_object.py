@@ -265,7 +265,7 @@ def _close(generators: list[np.ndarray]) -> list[np.ndarray]:
     for element in group:  # grows while it is walked through
         for generator in generators:
             product = generator @ element
-            if not any(np.allclose(product, member, atol=1e-3) for member in group):
+            if np.abs(np.array(group) - product).max((1, 2)).min() > 1e-3:
                 group.append(product)
             if len(group) > MAX_ORDER:
                 raise ValueError(f"symmetry must generate at most {MAX_ORDER} elements, like turns by 360 / n degrees "
