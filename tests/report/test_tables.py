@@ -11,7 +11,7 @@ from mmgsd.studies import main
 from mmgsd.studies.broken_symmetry import describe_fixes
 from mmgsd.studies.errors import describe_difficulties
 from mmgsd.studies.places import describe_places
-from mmgsd.studies.seeds import compare_seeds, describe_seeds, make_first_seed_sentence
+from mmgsd.studies.seeds import ALIKE, STUDY, compare_seeds, describe_seeds, make_first_seed_sentence
 from mmgsd.studies.sigma import describe_sigma
 from mmgsd.studies.symmetry import describe_symmetry
 from mmgsd.studies.table import LABELS, Column, Table, describe_errors, lay_out, to_markdown
@@ -112,6 +112,15 @@ def test_what_seeds_tell_apart_from_mmgsd_is_marked() -> None:
     cloth = {f"{name}-{seed}": {"rmse_mean": e} for name, found in errors.items() for seed, e in enumerate(found)}
     rows = {line.split(" | ")[0]: line.split(" | ")[1] for line in read_page(describe_seeds({"cloth": cloth}))[2:]}
     assert rows == {"| **MMGSD** (ours)": "51.0 ± 1.0 (3)", "| SPCL": "61.2 ± 1.3 (3) *", "| PCL": "53.3 ± 4.5 (3)"}
+
+
+def test_at_the_main_size_seeds_are_compared_under_one_supervision() -> None:
+    errors = {"mmgsd": (26.0, 26.2), "mmgsd_plain": (36.1, 36.7, 36.3), "spcl": (39.3, 39.7, 39.5), "pcl": (40.1,)}
+    cloth = {f"{name}-{seed}": {"rmse_mean": e} for name, found in errors.items() for seed, e in enumerate(found)}
+    shown = STUDY.tables["seeds"].make({"cloth": cloth})
+    rows = {line.split(" | ")[0]: line.split(" | ")[1] for line in read_page(shown)[2:]}
+    assert compare_seeds({"cloth": cloth}, ALIKE).keys() == {("cloth", "spcl")}
+    assert rows["| SPCL"] == "39.5 ± 0.2 (3) *" and rows["| MMGSD, own loss alone"] == "36.4 ± 0.3 (3)"
 
 
 def test_many_comparisons_are_corrected_for_by_hand() -> None:
