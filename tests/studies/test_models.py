@@ -12,6 +12,7 @@ from mmgsd.config import METHODS, OBJECTS, TrainConfig, load_preset
 from mmgsd.match.baselines import BASELINES
 from mmgsd.measure.evaluation import CHANCE
 from mmgsd.paths import find_root
+from mmgsd.studies import cells
 from mmgsd.studies.models import (
     GREY,
     MODELS,
@@ -68,7 +69,8 @@ def find_row(preset: str, key: str) -> TrainConfig:
     study, _, steps = file.partition("_")
     if study == "robustness":
         return list_models(preset, object, int(name[-1]) + 1, STEPS)[name]
-    varied = {"sigma": lambda: vary_sigma([float(name)]), "seeds": lambda: vary_seed([int(name[-1])])}
+    varied = {"sigma": lambda: vary_sigma([float(name)]), "seeds": lambda: vary_seed([int(name[-1])]),
+              "cells": lambda: cells.SHOWN}  # fmt: skip
     rows = varied[study]() if study in varied else None
     study = "main" if study == "runs" else study
     return configure_study(load_preset(preset), object, study, rows, steps=int(steps or 0))[name]
@@ -84,7 +86,7 @@ def test_models_whose_results_are_kept_keep_their_names(preset: str, key: str, n
 
 def test_every_file_of_results_with_models_is_looked_at() -> None:
     files = {f"{preset}/{key.split('/')[0]}" for preset, key, _ in STORED}
-    paper = ("runs", "budget", "sigma", "sigma_4000", "seeds", "seeds_1000", "backbones_1500")
+    paper = ("runs", "budget", "sigma", "sigma_4000", "seeds", "seeds_1000", "backbones_1500", "cells")
     quick = ("runs", "sigma", "seeds", "robustness")
     assert files == {f"paper/{name}" for name in paper} | {f"quick/{name}" for name in quick}
 
