@@ -83,7 +83,7 @@ def test_what_stands_beside_the_packages_imports_none() -> None:
     [
         (
             "import mmgsd.learn.training, mmgsd.measure.calibration",
-            ("mmgsd.match.baselines", "skimage", "sklearn", "matplotlib", "ipywidgets"),
+            ("mmgsd.match.baselines", "skimage", "sklearn", "scipy.stats", "matplotlib", "ipywidgets"),
         ),
         ("from mmgsd.studies.registry import list_studies; list_studies()", ("distributed", "bpy")),
     ],

@@ -17,7 +17,7 @@ from mmgsd.studies.table import LABELS, Table, describe_objects
 
 SEEDS = 3  # from which a spread over seeds is spoken of
 LEVEL = 0.05  # of p, from which seeds do not tell two methods apart
-ALIKE = {  # method: MMGSD with the supervision that it has, dense by single images or not
+SAME_SUPERVISION = {  # method: MMGSD with its supervision, dense by single images or not
     **dict.fromkeys(("spcl", "spcl_hidden", "pcl"), "mmgsd_plain"),
     **dict.fromkeys(("spcl_dense", "unimodal"), "mmgsd"),
 }
@@ -118,7 +118,7 @@ def count_findings(results: Results) -> dict[str, str]:
 STUDY = Study(
     "seeds", 30, partial(run_matrix, seeds=SEEDS), results=("seeds_1000",),
     tables={
-        "seeds": Shown("paper/seeds.json", partial(describe_seeds, others=ALIKE)),
+        "seeds": Shown("paper/seeds.json", partial(describe_seeds, others=SAME_SUPERVISION)),
         "seeds_1000": Shown("paper/seeds_1000.json", describe_seeds),
         "first_seed": Shown("paper/seeds_1000.json", make_first_seed_sentence),
         "seeds_quick": Shown("quick/seeds.json", describe_seeds),

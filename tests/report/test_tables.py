@@ -11,7 +11,7 @@ from mmgsd.studies import main
 from mmgsd.studies.broken_symmetry import describe_fixes
 from mmgsd.studies.errors import describe_difficulties
 from mmgsd.studies.places import describe_places
-from mmgsd.studies.seeds import ALIKE, STUDY, compare_seeds, describe_seeds, make_first_seed_sentence
+from mmgsd.studies.seeds import SAME_SUPERVISION, STUDY, compare_seeds, describe_seeds, make_first_seed_sentence
 from mmgsd.studies.sigma import describe_sigma
 from mmgsd.studies.symmetry import describe_symmetry
 from mmgsd.studies.table import LABELS, Column, Table, describe_errors, lay_out, to_markdown
@@ -119,7 +119,7 @@ def test_at_the_main_size_seeds_are_compared_under_one_supervision() -> None:
     cloth = {f"{name}-{seed}": {"rmse_mean": e} for name, found in errors.items() for seed, e in enumerate(found)}
     shown = STUDY.tables["seeds"].make({"cloth": cloth})
     rows = {line.split(" | ")[0]: line.split(" | ")[1] for line in read_page(shown)[2:]}
-    assert compare_seeds({"cloth": cloth}, ALIKE).keys() == {("cloth", "spcl")}
+    assert compare_seeds({"cloth": cloth}, SAME_SUPERVISION).keys() == {("cloth", "spcl")}
     assert rows["| SPCL"] == "39.5 ± 0.2 (3) *" and rows["| MMGSD, own loss alone"] == "36.4 ± 0.3 (3)"
 
 
