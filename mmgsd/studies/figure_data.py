@@ -158,8 +158,11 @@ def _fit_answer(images: Mapping[str, np.ndarray], xy: np.ndarray, cells: np.ndar
     return Match(**images, xy=xy, cells=cells, entropy=entropy.numpy(), **values)
 
 
-def load_figure_data(path: Path) -> FigureData:
-    """Read what `save_figure_data` wrote; FileNotFoundError, or ValueError for another or a damaged file."""
+def load_figure_data(path: Path, *, answers: bool = True) -> FigureData:
+    """Read what `save_figure_data` wrote; FileNotFoundError, or ValueError for another or a damaged file.
+
+    Without ``answers``, whose modes are fitted anew, they are left out.
+    """
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist: run notebooks/04_evaluate.ipynb with run=True for this preset")
     try:
@@ -169,10 +172,10 @@ def load_figure_data(path: Path) -> FigureData:
         summaries = {m: [tensors[f"errors/{m}/{name}"] for name in _SUMMARY] for m in note["methods"]}
         errors = {m: ErrorSummary(tensors["asked"], *summary) for m, summary in summaries.items()}
         images = {n: cv2.cvtColor(cv2.imdecode(tensors[n], cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB) for n in _IMAGES}
-        answers = {m: _fit_answer(images, tensors["xy"], tensors[_CELLS.format(m)], tensors["n"])
-                   for m in note["models"]}  # fmt: skip
+        fitted = {m: _fit_answer(images, tensors["xy"], tensors[_CELLS.format(m)], tensors["n"])
+                  for m in note["models"] if answers}  # fmt: skip
         true = [tensors[TRUE.format(k or "")] for k in range(sum(name.startswith("true") for name in tensors))]
-        return FigureData(errors, float(note["object_size_px"]), answers, true)
+        return FigureData(errors, float(note["object_size_px"]), fitted, true)
     except (SafetensorError, OSError, KeyError, TypeError, ValueError, AttributeError, cv2.error) as error:
         remedy = "restore it (it may be in git), or run notebooks/04_evaluate.ipynb with run=True for this preset"
         raise DamagedFileError(f"{path} does not hold the data of figures ({error}): {remedy}") from error

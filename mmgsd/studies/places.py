@@ -24,7 +24,8 @@ COMMAND = "`04_evaluate`, `07_figures`"
 
 def measure_all(folder: Path, results: Results | None = None) -> dict[str, Any]:
     """``places``, ``peaks`` {object: `measure_places`, `count_peaks`} of a preset's data of figures, where it is."""
-    drawn = {name: load_figure_data(path) for name, path in main.list_drawn(folder).items() if path.is_file()}
+    files = {name: path for name, path in main.list_drawn(folder).items() if path.is_file()}
+    drawn = {name: load_figure_data(path, answers=False) for name, path in files.items()}
     places = {name: measure_places(data, name) for name, data in drawn.items()}
     return {"places": places, "peaks": {name: count_peaks(data) for name, data in drawn.items()}} if drawn else {}
 
