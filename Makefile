@@ -30,6 +30,8 @@ export MALLOC_MMAP_THRESHOLD_ ?= 4294967296
 export MALLOC_TRIM_THRESHOLD_ ?= 8589934592
 
 TORCH := 2.13.0
+# Later releases build a grammar of addresses at every import, 3 s in each process that opens a notebook.
+JSONSCHEMA := jsonschema<4.25
 PY := .venv/bin/python
 PIP := $(PY) -m pip --disable-pip-version-check install --quiet --only-binary :all:
 STAMP := .venv/.installed
@@ -141,7 +143,7 @@ lock: ## Make environment.lock from pyproject.toml (UV=uv, FIND_LINKS=folder wit
 		echo "#    make lock FIND_LINKS=<a folder with the wheel of torch $(TORCH)+cpu>"; \
 		echo "# which keeps the pins it finds here; delete this file first to move all of them on."; } > environment.head
 	@[ ! -f environment.lock ] || cp environment.lock environment.new
-	echo "torch==$(TORCH)+cpu" | $(UV) pip compile --quiet --python-version 3.11 --generate-hashes --no-header --all-extras \
+	printf '%s\n' "torch==$(TORCH)+cpu" "$(JSONSCHEMA)" | $(UV) pip compile --quiet --python-version 3.11 --generate-hashes --no-header --all-extras \
 		$(if $(FIND_LINKS),--find-links "$(FIND_LINKS)") --annotation-style line --output-file environment.new pyproject.toml -
 	@sed -i -E 's/-r -(, |$$)//; s/, $$//' environment.new
 	cat environment.head environment.new > environment.lock
