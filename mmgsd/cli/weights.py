@@ -61,7 +61,7 @@ def export(*, out: Annotated[Path, Option("the file to write, .onnx", metavar="F
     difference = export_onnx(mmgsd.load(weights), out)
     print(f"{out}: images in, what Matcher.describe says of them out, the mean over quarter turns included; it "
           f"differs from torch's single precision by {difference:.1e} at most, and from Matcher.describe, which takes "
-          "bfloat16 for some layers on a CPU, by up to 1e-2")  # fmt: skip
+          "bfloat16 for some layers on a CPU that has it, by up to 1e-2")  # fmt: skip
 
 
 def page(

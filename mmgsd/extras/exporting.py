@@ -48,8 +48,8 @@ def export_onnx(matcher: Matcher, path: Path | str, *, half: bool = False) -> fl
     a ``Matcher.shrinkage`` the ``places`` that sources move towards (`describe_shrinkage`).
 
     What onnxruntime makes of random images of four shapes is compared with torch, both in single precision: returns the
-    largest difference, relative to the largest value. On a CPU, where `Matcher.describe` takes bfloat16 for some of its
-    layers, its descriptors differ from the file's by up to a hundredth. With ``half`` weights are stored in half
+    largest difference, relative to the largest value. On a CPU with bfloat16, which `Matcher.describe` takes for some
+    of its layers, its descriptors differ from the file's by up to a hundredth. With ``half`` weights are stored in half
     precision, and computed with in single: half the size, on any machine. ValueError for another ending than .onnx,
     RuntimeError where they differ by more than 1e-3 in single precision, or of ``half`` 1e-2; ``path`` is then as it
     was.

@@ -38,7 +38,7 @@ class PyramidNetwork(nn.Module):
     says where the object is, what is seen and whether it is there at all (`describe`).
     """
 
-    reduced_precision = True  # bfloat16 where that is faster
+    reduced_precision = True  # bfloat16 where that is faster (`has_bfloat16`)
 
     def __init__(
         self, descriptor_dim: int, *, roles: int = 1, passes: int = 1, detail: bool = False, heads: bool = False,
@@ -93,7 +93,7 @@ class PyramidNetwork(nn.Module):
     def _run(self, image: Tensor, *, with_heads: bool) -> Outputs:
         x = (image - self.mean) / self.std  # (B, 3, H, W)
         taps = self._compute_taps(x)
-        with self._autocast(image):
+        with _autocast(image.device, self.reduced_precision):
             features, finer = [lateral(f) for lateral, f in zip(self.lateral, taps, strict=True)], []
             if self.trunk is None:
                 features = self._spread(features, x.shape[-2:])
@@ -107,10 +107,11 @@ class PyramidNetwork(nn.Module):
     def _compute_taps(self, x: Tensor) -> list[Tensor]:
         """The trunk's features of each level, the finest first."""
         if self.trunk is None:
-            dtype = torch.bfloat16 if self.reduced_precision else torch.float32
+            reduced = self.reduced_precision and has_bfloat16(x.device)
+            dtype = torch.bfloat16 if reduced else torch.float32
             return [dinov2.compute_features(x, 2 * self.stride, dtype=dtype)] * len(TAPS)
         # a CPU gains from bf16 in dense 3 x 3 convolutions and loses in the trunk's depthwise ones; a GPU gains in all
-        with self._autocast(x, x.device.type != "cpu"):
+        with _autocast(x.device, self.reduced_precision and x.device.type != "cpu"):
             return compute_taps(self.trunk, x if self.detail is None else F.avg_pool2d(x, 2))
 
     def _spread(self, features: list[Tensor], size: tuple[int, int]) -> list[Tensor]:
@@ -128,9 +129,6 @@ class PyramidNetwork(nn.Module):
         for block in self.detail:
             features.append(block(features[-1]))
         return features[1:]
-
-    def _autocast(self, image: Tensor, wanted: bool = True) -> torch.autocast:
-        return torch.autocast(image.device.type, torch.bfloat16, enabled=wanted and self.reduced_precision)
 
     def _decode(self, features: list[Tensor]) -> list[Tensor]:
         """The pyramid's levels, the coarsest first."""
@@ -198,7 +196,7 @@ class ResNet34Network(nn.Module):
 
     def forward(self, image: Tensor) -> Tensor:
         """(B, 3, H, W) in [0, 1] to (B, roles * D, H / 4, W / 4)."""
-        with torch.autocast(image.device.type, torch.bfloat16, enabled=self.reduced_precision):
+        with _autocast(image.device, self.reduced_precision):
             x = self.trunk((image - self.mean) / self.std)  # (B, 512, H / 8, W / 8)
         size = [side // self.stride for side in image.shape[-2:]]
         return _resize(self.head(x.float()), size)
@@ -366,7 +364,17 @@ def name_hardware(device: torch.device) -> str:
     if device.type == "cuda":
         return torch.cuda.get_device_name(device)
     threads, cores = torch.get_num_threads(), os.cpu_count()
-    return f"CPU, {cores} cores" if threads >= cores else f"CPU, {threads} of {cores} cores"
+    kind = "CPU" if has_bfloat16(device) else "CPU without bfloat16"
+    return f"{kind}, {cores} cores" if threads >= cores else f"{kind}, {threads} of {cores} cores"
+
+
+def has_bfloat16(device: torch.device) -> bool:
+    """Whether a device has instructions for bfloat16; a CPU without emulates it, several times slower than float32."""
+    return device.type != "cpu" or torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()
+
+
+def _autocast(device: torch.device, wanted: bool) -> torch.autocast:
+    return torch.autocast(device.type, torch.bfloat16, enabled=wanted and has_bfloat16(device))
 
 
 def _make_stage(inputs: int, outputs: int, blocks: int, *, stride: int = 1, dilation: int = 1) -> nn.Sequential:

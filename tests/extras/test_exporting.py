@@ -14,6 +14,7 @@ import torch
 import mmgsd
 from mmgsd.extras.exporting import export_onnx
 from mmgsd.match.matcher import Matcher
+from mmgsd.model.network import has_bfloat16
 
 ROOT = Path(__file__).parents[2]
 BLOCKS = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "onnx.md").read_text("utf-8"), re.DOTALL)
@@ -57,10 +58,10 @@ def test_the_program_of_the_docs_matches_as_the_library_does(matcher: Matcher, s
     assert apart.min(0).max() < 16 and apart.min(1).max() < 16  # px: a cell
 
 
-def test_the_difference_from_describe_is_bfloat16s(matcher: Matcher, said: dict[str, Any]) -> None:
+def test_the_difference_from_describe_is_bfloat16s_where_the_cpu_has_it(matcher: Matcher, said: dict[str, Any]) -> None:
     descriptors = matcher.describe([mmgsd.read_image(IMAGES[0])])[0].descriptors.numpy()
     difference = np.abs(said["outputs0"]["descriptors"] - descriptors).max() / np.abs(descriptors).max()
-    assert 1e-5 < difference < 1e-2
+    assert difference < 1e-2 and (difference > 1e-5) == has_bfloat16(torch.device("cpu"))
 
 
 def test_it_can_be_quantised(said: dict[str, Any]) -> None:

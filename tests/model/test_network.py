@@ -192,8 +192,36 @@ def test_squared_distances_gradient(generator: torch.Generator) -> None:
     assert torch.autograd.gradcheck(compute_squared_distances, given)
 
 
-@pytest.mark.parametrize(("threads", "said"), [(8, "CPU, 8 cores"), (1, "CPU, 1 of 8 cores")])
-def test_the_hardware_is_what_was_used_of_it(monkeypatch: pytest.MonkeyPatch, threads: int, said: str) -> None:
+def pretend_bfloat16(monkeypatch: pytest.MonkeyPatch, *, there: bool) -> None:
+    """A CPU with instructions for bfloat16, or without."""
+    monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: there)
+    monkeypatch.setattr(torch.cpu, "_is_amx_tile_supported", lambda: False)
+
+
+@pytest.mark.parametrize(
+    ("threads", "bfloat16", "said"),
+    [(8, True, "CPU, 8 cores"), (1, True, "CPU, 1 of 8 cores"), (1, False, "CPU without bfloat16, 1 of 8 cores")],
+)
+def test_the_hardware_is_what_was_used_of_it(
+    monkeypatch: pytest.MonkeyPatch, threads: int, bfloat16: bool, said: str
+) -> None:
     monkeypatch.setattr(networks.os, "cpu_count", lambda: 8)
     monkeypatch.setattr(networks.torch, "get_num_threads", lambda: threads)
+    pretend_bfloat16(monkeypatch, there=bfloat16)
     assert networks.name_hardware(torch.device("cpu")) == said
+
+
+def test_a_cpu_without_bfloat16_computes_in_float32(
+    monkeypatch: pytest.MonkeyPatch, generator: torch.Generator
+) -> None:
+    network, image = networks.PyramidNetwork(4, pretrained=False).eval(), torch.rand(1, 3, 64, 64, generator=generator)
+
+    def describe(*, there: bool, reduced: bool) -> torch.Tensor:
+        """Descriptors on a CPU with bfloat16 or without, where the network may take it or not."""
+        pretend_bfloat16(monkeypatch, there=there)
+        network.reduced_precision = reduced
+        return network(image)
+
+    exact = describe(there=True, reduced=False)
+    assert torch.equal(exact, describe(there=False, reduced=True))
+    assert not torch.equal(exact, describe(there=True, reduced=True))
