@@ -132,7 +132,7 @@ else
 		echo "torch's CPU build could not be installed. If pip found no version $(TORCH)+cpu above, run the command" \
 			"again with TORCH_INDEX=... set to PyTorch's index of CPU wheels, the address that the install page" \
 			"of PyTorch gives for 'CPU'; for the CUDA build set CUDA=1 instead." >&2; exit 1; }
-	$(PIP) --require-hashes -r environment.lock
+	$(PIP) --require-hashes --no-deps -r environment.lock
 endif
 	@pwd > "$$($(PY) -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/mmgsd.pth"
 	@echo $(if $(filter 1,$(CUDA)),cuda,cpu)-$(LOCKED) > $@.new
