@@ -96,8 +96,8 @@ def test_knowledge_is_of_weights_alone() -> None:
 
 
 def test_a_sentence_counts_the_photographs() -> None:
-    said = "Photographs: 34 of cloths and 32 of ropes. One question about two new images takes 140 ms (CPU, 2 cores)."
-    assert make_counts_sentence(ROWS) == said
+    said = make_counts_sentence(ROWS)
+    assert "34 of cloths and 32 of ropes" in said and "takes 140 ms (CPU with bfloat16, 2 cores)" in said
 
 
 def test_each_repository_is_a_row_and_what_it_lacks_a_dash() -> None:
