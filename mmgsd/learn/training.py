@@ -7,14 +7,16 @@ import json
 import math
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import torch
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+from torch.overrides import TorchFunctionMode
 from torch.utils import deterministic
 
 from mmgsd.checks import read_count, read_flag
@@ -38,7 +40,7 @@ from mmgsd.learn.objective import compute_head_loss, compute_loss
 from mmgsd.match.matcher import Matcher, load
 from mmgsd.measure.calibration import calibrate_bandwidth, calibrate_modes, calibrate_temperature, describe_places
 from mmgsd.measure.questions import measure_rmse
-from mmgsd.model.network import build_network, find_device, name_hardware, sample_descriptors
+from mmgsd.model.network import build_network, find_device, has_bfloat16, name_hardware, sample_descriptors
 from mmgsd.model.tensors import WEIGHTS, write_tensors
 from mmgsd.model.weights import PLACES
 from mmgsd.numerics import own_numerics
@@ -56,6 +58,14 @@ def compute_learning_rate(config: TrainConfig, step: int) -> float:
     progress = (step - warm_up) / max(1, config.steps - warm_up)
     cosine = 0.5 * (1 + math.cos(math.pi * min(1.0, max(0.0, progress))))
     return config.learning_rate * (min(1.0, (step + 1) / warm_up) * (0.01 + 0.99 * cosine))
+
+
+class Bfloat16AsFloat32(TorchFunctionMode):
+    """Within it ``tensor.bfloat16()`` is a copy in float32: torch's Muon asks for nothing else."""
+
+    def __torch_function__(self, function: Any, types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
+        """Call the function, or copy."""
+        return args[0].float().clone() if function is Tensor.bfloat16 else function(*args, **(kwargs or {}))
 
 
 class ConvolutionMuon(torch.optim.Muon):
@@ -76,7 +86,9 @@ class ConvolutionMuon(torch.optim.Muon):
         """Step with the convolutions' gradients."""
         for weight, matrix in zip(self.weights, self.param_groups[0]["params"], strict=True):
             matrix.grad = None if weight.grad is None else _view_as_matrix(weight.grad)
-        super().step()
+        emulated = self.weights and not has_bfloat16(self.weights[0].device)
+        with Bfloat16AsFloat32() if emulated else nullcontext():
+            super().step()
 
     def zero_grad(self, set_to_none: bool = True) -> None:
         """Clear the convolutions' gradients too."""

@@ -9,6 +9,7 @@ import torch
 from torch import nn
 
 from mmgsd.config import NETWORKS, TrainConfig
+from mmgsd.learn import training
 from mmgsd.learn.training import ConvolutionMuon, make_optimisers
 from mmgsd.model.network import build_network
 
@@ -57,6 +58,19 @@ def test_muon_steps_are_orthogonal_and_as_long_as_said() -> None:
     step = (before - weight.detach()).flatten(1) / 0.01
     values = torch.linalg.svdvals(step)  # Newton and Schulz's iteration leaves them between 0.7 and 1.2 or so
     torch.testing.assert_close(values, torch.full_like(values, 0.2 * 54**0.5), rtol=0.4, atol=0)
+
+
+def test_muon_steps_in_float32_where_there_is_no_bfloat16(monkeypatch: pytest.MonkeyPatch) -> None:
+    gradient, steps = torch.randn(8, 6, 3, 3), {}
+    first = make_weight(8, 6, 3, 3).detach()
+    for there in (True, False):
+        monkeypatch.setattr(training, "has_bfloat16", lambda device, there=there: there)
+        weight = nn.Parameter(first.clone())
+        weight.grad = gradient.clone()
+        ConvolutionMuon([weight], lr=0.01, weight_decay=0.0).step()
+        steps[there] = weight.detach() - first
+    torch.testing.assert_close(steps[False], steps[True], rtol=0, atol=0.05 * steps[True].abs().max().item())
+    assert not torch.equal(steps[False], steps[True])
 
 
 def test_muon_does_not_care_how_a_gradient_lies_in_memory() -> None:
