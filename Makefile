@@ -143,8 +143,9 @@ lock: ## Make environment.lock from pyproject.toml (UV=uv, FIND_LINKS=folder wit
 		echo "#    make lock FIND_LINKS=<a folder with the wheel of torch $(TORCH)+cpu>"; \
 		echo "# which keeps the pins it finds here; delete this file first to move all of them on."; } > environment.head
 	@[ ! -f environment.lock ] || cp environment.lock environment.new
-	printf '%s\n' "torch==$(TORCH)+cpu" "$(JSONSCHEMA)" | $(UV) pip compile --quiet --python-version 3.11 --generate-hashes --no-header --all-extras \
-		$(if $(FIND_LINKS),--find-links "$(FIND_LINKS)") --annotation-style line --output-file environment.new pyproject.toml -
+	printf '%s\n' "torch==$(TORCH)+cpu" "$(JSONSCHEMA)" | $(UV) pip compile --quiet --python-version 3.11 --generate-hashes \
+		--no-header --all-extras $(if $(FIND_LINKS),--find-links "$(FIND_LINKS)") --annotation-style line \
+		--output-file environment.new pyproject.toml -
 	@sed -i -E 's/-r -(, |$$)//; s/, $$//' environment.new
 	cat environment.head environment.new > environment.lock
 	@rm environment.head environment.new
