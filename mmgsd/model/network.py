@@ -369,8 +369,14 @@ def name_hardware(device: torch.device) -> str:
 
 
 def has_bfloat16(device: torch.device) -> bool:
-    """Whether a device has instructions for bfloat16; a CPU without emulates it, several times slower than float32."""
-    return device.type != "cpu" or torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()
+    """Whether a device has instructions for bfloat16, as far as is known.
+
+    One without, such as a GPU before Ampere, emulates it, several times slower than float32.
+    """
+    if device.type == "cuda":
+        with torch.cuda.device(device):
+            return torch.cuda.is_bf16_supported(including_emulation=False)
+    return device.type == "cpu" and (torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported())
 
 
 def _autocast(device: torch.device, wanted: bool) -> torch.autocast:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -225,3 +226,11 @@ def test_a_cpu_without_bfloat16_computes_in_float32(
     exact = describe(there=True, reduced=False)
     assert torch.equal(exact, describe(there=False, reduced=True))
     assert not torch.equal(exact, describe(there=True, reduced=True))
+
+
+@pytest.mark.parametrize("ampere", [False, True])
+def test_a_gpu_that_emulates_bfloat16_has_none(monkeypatch: pytest.MonkeyPatch, ampere: bool) -> None:
+    monkeypatch.setattr(torch.cuda, "device", lambda device: nullcontext())
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation=True: including_emulation or ampere)
+    assert networks.has_bfloat16(torch.device("cuda", 1)) == ampere
+    assert not networks.has_bfloat16(torch.device("mps"))  # nothing is known of it
