@@ -15,7 +15,7 @@ from mmgsd.measure.evaluation import read_results, write_results
 from mmgsd.measure.joint import RESULTS, measure_joint
 from mmgsd.paths import Paths, find_root
 from mmgsd.studies.registry import Shown, Study
-from mmgsd.studies.shipped import SETS
+from mmgsd.studies.shipped import SETS, say_hardware
 from mmgsd.studies.table import Table, make_page_table, say_value
 
 HEADS = {"heaviest": "right: heaviest modes", "joint": "first joint answer", "any_joint": "mean of joint answers",
@@ -48,7 +48,7 @@ def make_joint_sentence(rows: Mapping[str, Mapping[str, Any]]) -> str:
     """How many questions were asked, and what a joint answer costs."""
     questions = sum(row[preset]["all"]["questions"] for row in rows.values() for preset in SETS if preset in row)
     cost = max(row["milliseconds"]["joint"] - row["milliseconds"]["alone"] for row in rows.values())
-    hardware = next(iter(rows.values()))["hardware"]
+    hardware = say_hardware(next(iter(rows.values())))
     return f"{questions} questions. A joint answer takes up to {cost} ms more than one that is not ({hardware})."
 
 

@@ -94,13 +94,13 @@ def describe_limits(rows: Rows) -> Table:
                           "another picture ({} of the questions not answered); of a rope's ends {} and {} ({})".format(
                               *seen[0], *seen[1]),
         "it takes": f"{slowest['milliseconds']:.0f} ms for two new images and a question{_tell_described(slowest)} "
-                    f"({_tell_hardware(slowest)}); a GPU is not needed",
+                    f"({say_hardware(slowest)}); a GPU is not needed",
         "on a robot": "never tried",
     }  # fmt: skip
     return make_page_table([" "], {name: [text] for name, text in lines.items()})
 
 
-def _tell_hardware(row: Mapping[str, Any]) -> str:
+def say_hardware(row: Mapping[str, Any]) -> str:
     """What a row was made on; of a CPU also whether it has bfloat16 (`mmgsd.model.network.name_hardware`)."""
     return row["hardware"].replace("CPU,", "CPU with bfloat16,")
 
@@ -258,7 +258,7 @@ def make_counts_sentence(rows: Rows) -> str:
     """How many photographs were asked about, and how long a question takes."""
     counts = " and ".join(f"{rows[object]['photographs']['photographs']} of {object}s" for object in OBJECTS)
     slowest = max(OBJECTS, key=lambda object: rows[object]["milliseconds"])
-    took, hardware = rows[slowest]["milliseconds"], _tell_hardware(rows[slowest])
+    took, hardware = rows[slowest]["milliseconds"], say_hardware(rows[slowest])
     return f"Photographs: {counts}. One question about two new images takes {took:.0f} ms ({hardware})."
 
 

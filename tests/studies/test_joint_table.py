@@ -20,5 +20,5 @@ def test_rows_are_object_set_and_state() -> None:
 
 def test_questions_and_cost_are_said() -> None:
     assert make_joint_sentence(ROWS) == (
-        "12 questions. A joint answer takes up to 130 ms more than one that is not (CPU, 1 of 2 cores)."
+        "12 questions. A joint answer takes up to 130 ms more than one that is not (CPU with bfloat16, 1 of 2 cores)."
     )
