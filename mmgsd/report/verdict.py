@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from mmgsd.config import CONTRASTIVE
 from mmgsd.files import DamagedFileError, is_kept, write_json, write_text
 from mmgsd.paths import Paths
 from mmgsd.report.stages import find_run
@@ -137,7 +138,7 @@ def compute_tolerance(
     rule: Measure, name: str, row: str, stored: float, spreads: Mapping[tuple[str, str, str], float]
 ) -> float:
     """How far a number of the object ``name`` may be from the stored one, in its own unit."""
-    floor = max(rule.floor, rule.share * abs(stored))
+    floor = max(rule.floor, rule.contrastive if row in CONTRASTIVE else 0.0, rule.share * abs(stored))
     if row in {model.name for model in UNTRAINED}:
         return floor
     largest = max((std for (of, _, like), std in spreads.items() if (of, like) == (name, rule.like)), default=0.0)

@@ -46,6 +46,7 @@ class Measure:
     """
 
     floor: float = 0.0  # in its own unit
+    contrastive: float = 0.0  # the floor of PCL and SPCL, whose heatmap's bandwidth is chosen in steps of two
     share: float = 0.0  # of the stored value
     like: str = ""  # the measure whose spread over seeds is its own
 

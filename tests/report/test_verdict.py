@@ -89,6 +89,8 @@ def test_a_number_is_judged_by_its_tolerance(stored: float | None, found: float 
         ("aurc", "mmgsd", SEEDS, 6.0),  # a mean of errors
         ("pck@20px", "mmgsd", SEEDS, 0.015),
         ("spearman", "mmgsd", SEEDS, 0.05),
+        ("ece", "mmgsd", SEEDS, 0.05),
+        ("ece", "spcl", SEEDS, 0.15),  # by the steps in which its bandwidth is chosen
     ],
 )  # fmt: skip
 def test_the_tolerance_comes_from_the_seeds_and_has_a_floor(
