@@ -20,7 +20,7 @@ from mmgsd.measure import calibration
 from mmgsd.model.tensors import read_tensors
 from mmgsd.studies.models import configure_study
 
-STEPS = 4
+STEPS = 2
 TINY = {"steps": STEPS, "batch": 2, "pairs": 2, "queries": 8, "input_px": 128, "also": ""}
 
 
