@@ -369,10 +369,7 @@ def name_hardware(device: torch.device) -> str:
 
 
 def has_bfloat16(device: torch.device) -> bool:
-    """Whether a device has instructions for bfloat16, as far as is known.
-
-    One without, such as a GPU before Ampere, emulates it, several times slower than float32.
-    """
+    """Whether a device has instructions for bfloat16, as far as is known; one without emulates it, slowly."""
     if device.type == "cuda":
         with torch.cuda.device(device):
             return torch.cuda.is_bf16_supported(including_emulation=False)

@@ -265,7 +265,7 @@ STUDY = Study(
     compared={
         "aurc": Measure(share=0.03, like="rmse_mean"),  # px: a mean of RMSE
         "spearman": Measure(floor=0.05),  # no seeds are stored of this and the next two
-        # another kind of CPU chose another bandwidth for a rope's SPCL: before calibration they moved by 0.10 and 0.09
+        # on another kind of CPU those of a rope's SPCL, before calibration, moved by 0.10 and 0.09 (LOG.md, 2026-11-28)
         "coverage@90%": Measure(floor=0.05, contrastive=0.15),
         "ece": Measure(floor=0.05, contrastive=0.15),
     },
