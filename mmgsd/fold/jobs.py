@@ -57,9 +57,16 @@ def act_job(state: Path, moves: Sequence[PixelMove]) -> dict:
     return _go_on(state, {"kind": "act", "moves": _read_moves(moves)})
 
 
-def look_job(state: Path, again: int) -> dict:
-    """The state in a file, seen by another camera, the ``again``-th, from 1."""
-    return _go_on(state, {"kind": "look", "again": read_count("again", again, least=1)})
+def look_job(state: Path, again: int, *, tilt_deg: float | None = None) -> dict:
+    """The state in a file, seen by another camera, the ``again``-th, from 1.
+
+    With ``tilt_deg`` it looks from aside, so far from straight down. ValueError for a tilt beyond 80, and where the
+    ground is not plain.
+    """
+    check_choice("ground", read_state(state).about["ground"], GROUNDS if tilt_deg is None else ("plain",))
+    check("tilt_deg", tilt_deg, "None, or between 0 and 80", tilt_deg is None or 0 <= tilt_deg <= 80)
+    tilt = {} if tilt_deg is None else {"tilt_deg": float(tilt_deg)}
+    return _go_on(state, {"kind": "look", "again": read_count("again", again, least=1)} | tilt)
 
 
 def film_job(

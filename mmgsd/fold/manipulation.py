@@ -48,6 +48,7 @@ LIFT = 0.35  # height of a cloth's arc over its length: with a half circle's 0.5
 FRICTION = 80.0  # of the table: what lies on it must not be dragged along by what is lifted
 LAID_AT = 0.03  # m above the table, where grippers let go of a cloth
 MAX_STRETCH = 1.35  # of a rope, and of the 99th percentile of a cloth's edges: four layers in grippers reach 1.2
+ASIDE_FILL, ASIDE_NEARNESS = 0.9, 2.0  # of a look from aside, as `frame_points` has them
 LEAST_SEEN = 0.8  # share of the material points in the picture
 LEAN, CLEAR = 1.1, 0.02  # rad from upright that a gripper or a hand leans in a film; m between its tip and the object
 
@@ -279,7 +280,7 @@ def _find_tips(motion: str, share: float, first: np.ndarray, places: np.ndarray)
 
 def look_again(state: State, job: dict[str, Any]) -> State:
     """The same state, seen by the camera of another number than the rollout's own, which is 0; at rest meanwhile."""
-    about = state.about | {"again": job["again"], "mark": job["mark"]}
+    about = state.about | {key: job[key] for key in ("again", "mark", "tilt_deg") if key in job}
     if about["fault"]:
         return dataclasses.replace(state, about=about)
     return _look(state.vertices, state.first, about)
@@ -336,6 +337,9 @@ def _draw_camera(room: np.ndarray, about: dict[str, Any]) -> tuple[Camera, float
     rng, size = _stream(about, "camera"), tuple(about.get("size", IMAGE_SIZE[about["object"]]))
     if about["demonstration"]:
         return frame_points(rng, room, size, 0.0, 0.0, 0.85, 3.0, shift=0.0), 0.0
+    if "tilt_deg" in about:
+        turn = rng.uniform(-np.pi, np.pi)
+        return frame_points(rng, room, size, turn, about["tilt_deg"], ASIDE_FILL, ASIDE_NEARNESS, shift=0.0), turn
     if about["ground"] == "plain":
         camera, turn = randomize.draw_camera(rng, room, size, about.get("turn_deg", 180.0))
         return camera, float(np.radians(turn))

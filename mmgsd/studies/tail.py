@@ -157,19 +157,29 @@ def measure_floors(data: Dataset, config: EvaluateConfig, group: str) -> pd.Data
     points, symmetry = choose_points(config.points, data.n_points), data.group(group)
     orbits, rows = [symmetry.distinct_modes(int(point)) for point in points], []
     for image in np.unique(draw_pairs(data, config)[:, 1]):
-        xy, ways = data.xy[image].astype(float), []
-        mask = data.load_mask(int(image))
-        for affine in find_outline_symmetries(mask) if mask.any() else []:
-            mirrored = np.linalg.det(affine[:, :2]) < 0
-            if mirrored and data.mirror is None:
-                continue
-            labels = xy[data.mirror] if mirrored else xy
-            ways.append(labels @ affine[:, :2].T + affine[:, 2])
-        ways = [*ways[:1], *(way for way in ways[1:] if _compare(way, xy, orbits) > CELL_PX)]
+        ways = list_ways(data.xy[image].astype(float), data.load_mask(int(image)), data.mirror, orbits)
         if ways:
             floor = float(np.mean([_measure_floor(ways, orbit) for orbit in orbits]))
             rows.append((data.labels.state.iloc[image], len(ways), floor))
     return pd.DataFrame(rows, columns=["state", "ways", "floor_px"])
+
+
+def list_ways(
+    xy: np.ndarray, mask: np.ndarray, mirror: np.ndarray | None, orbits: list[np.ndarray]
+) -> list[np.ndarray]:  # fmt: skip
+    """Where (P, 2) px the points at ``xy`` may as well lie by the outline of a ``mask`` (H, W) alone, as they do first.
+
+    ``mirror`` (P,) are the points of the mirrored object, None where it has no mirror image; ways that the symmetry,
+    whose ``orbits`` are asked for, does not tell apart are one. Empty without an outline.
+    """
+    ways = []
+    for affine in find_outline_symmetries(mask) if mask.any() else []:
+        mirrored = np.linalg.det(affine[:, :2]) < 0
+        if mirrored and mirror is None:
+            continue
+        labels = xy[mirror] if mirrored else xy
+        ways.append(labels @ affine[:, :2].T + affine[:, 2])
+    return [*ways[:1], *(way for way in ways[1:] if _compare(way, xy, orbits) > CELL_PX)]
 
 
 def _compare(way: np.ndarray, xy: np.ndarray, orbits: list[np.ndarray]) -> float:

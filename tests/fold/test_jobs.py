@@ -153,6 +153,7 @@ REFUSED = {
     "task .*got 'iron'": lambda state: start_job(dataclasses.replace(TASKS["edge"], name="iron"), "flat", "plain", 0),
     "moves": lambda state: act_job(state, [((0.0, np.nan), (1.0, 1.0))]),
     "again": lambda state: look_job(state, 0),
+    "tilt_deg": lambda state: look_job(state, 1, tilt_deg=90.0),
     "motion": lambda state: film_job(state, NOWHERE, "dance", frames=2),
 }
 
@@ -161,6 +162,12 @@ REFUSED = {
 def test_jobs_refuse_what_no_task_has(first, message):
     with pytest.raises(ValueError, match=message):
         REFUSED[message](first["edge"])
+
+
+def test_only_a_plain_ground_is_looked_at_from_aside(first):
+    with pytest.raises(ValueError, match="ground"):
+        look_job(first["straighten"], 1, tilt_deg=60.0)
+    assert look_job(first["edge"], 1)["mark"] != look_job(first["edge"], 1, tilt_deg=60.0)["mark"]
 
 
 def test_an_act_is_marked_by_the_state_that_it_goes_on_from(first):
