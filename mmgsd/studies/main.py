@@ -117,7 +117,7 @@ def describe_presets(results: Mapping[str, Results]) -> Table:
     """MMGSD's RMSE by preset, from {path of the results file: errors}."""
     rows = {f"`{Path(path).parent}`": {name: errors[name]["mmgsd"]["rmse_mean"] for name in OBJECTS}
             for path, errors in results.items()}  # fmt: skip
-    return describe_objects("preset", rows, ("MMGSD's RMSE px: cloth", "rope"), ".0f")
+    return describe_objects("preset", rows, {"cloth": "MMGSD's RMSE px: cloth", "rope": "rope"}, ".0f")
 
 
 def judge_rmse(results: Results, *, row: str = "mmgsd_plain") -> Claim:

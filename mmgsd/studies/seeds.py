@@ -23,20 +23,26 @@ SAME_SUPERVISION = {  # method: MMGSD with its supervision, dense by single imag
 }
 
 
-def list_seeds(rows: Results, method: str) -> list[float]:
-    """The errors of a method's seeds, from {"mmgsd-0": errors}."""
-    return [row["rmse_mean"] for key, row in rows.items() if key.rpartition("-")[0] == method]
+def list_seeds(rows: Results, method: str, measure: str = "rmse_mean") -> list[float]:
+    """The errors of those seeds of a method that have a ``measure``, from {"mmgsd-0": errors}."""
+    return [row[measure] for key, row in rows.items() if key.rpartition("-")[0] == method and measure in row]
 
 
-def describe_seeds(results: Results, others: Mapping[str, str] | None = None) -> Table:
+def describe_seeds(results: Results, others: Mapping[str, str] | None = None, *, seen: bool = False) -> Table:
     """The mean and the std of the RMSE over seeds, from {object: {"mmgsd-0": errors}}, a method a row.
 
-    Marked (`say_tested`) where it differs from MMGSD's, or from that of ``others`` (`compare_seeds`).
+    Marked (`say_tested`) where it differs from MMGSD's, or from that of ``others`` (`compare_seeds`). With ``seen``
+    that over seen matches alone stands beside it.
     """
     tested = compare_seeds(results, others)
     seeds = {label: {name: say_tested(results, tested, name, method) for name in OBJECTS}
+             | {f"{name} seen": say_seeds(results.get(name, {}), method, "rmse_seen") for name in OBJECTS if seen}
              for method, label in LABELS.items()}  # fmt: skip
-    return describe_objects("RMSE px: mean ± std (seeds)", {k: row for k, row in seeds.items() if any(row.values())})
+    heads = {name: name for name in OBJECTS}
+    if seen:
+        heads = {key: head for name in OBJECTS for key, head in ((name, name), (f"{name} seen", "of seen matches"))}
+    return describe_objects("RMSE px: mean ± std (seeds)", {k: row for k, row in seeds.items() if any(row.values())},
+                            heads)  # fmt: skip
 
 
 Tested = Mapping[tuple[Any, str], tuple[float, float]]  # as `compare_seeds` has it
@@ -75,9 +81,9 @@ def make_first_seed_sentence(results: Results) -> str:
     return f"The tables of budget, σ and symmetry rest on MMGSD's seed 0: {', '.join(texts)}."
 
 
-def say_seeds(rows: Results, method: str) -> str | None:
+def say_seeds(rows: Results, method: str, measure: str = "rmse_mean") -> str | None:
     """Mean, std of the sample, and how many: "54.6 ± 0.8 (3)"; no std of one, None of none."""
-    values = list_seeds(rows, method)
+    values = list_seeds(rows, method, measure)
     if len(values) < 2:
         return f"{values[0]:.1f} (1)" if values else None
     return f"{statistics.mean(values):.1f} ± {statistics.stdev(values):.1f} ({len(values)})"
@@ -118,7 +124,7 @@ def count_findings(results: Results) -> dict[str, str]:
 STUDY = Study(
     "seeds", 30, partial(run_matrix, seeds=SEEDS), results=("seeds_1000",),
     tables={
-        "seeds": Shown("paper/seeds.json", partial(describe_seeds, others=SAME_SUPERVISION)),
+        "seeds": Shown("paper/seeds.json", partial(describe_seeds, others=SAME_SUPERVISION, seen=True)),
         "seeds_1000": Shown("paper/seeds_1000.json", describe_seeds),
         "first_seed": Shown("paper/seeds_1000.json", make_first_seed_sentence),
         "seeds_quick": Shown("quick/seeds.json", describe_seeds),

@@ -157,7 +157,10 @@ def describe_errors(results: Results, *, methods: Iterable[str] = tuple(LABELS))
     return Table("", blocks, collect_rows(results, labels), OBJECTS)
 
 
-def describe_objects(first: str, rows: Mapping[str, Results], heads: Sequence[str] = OBJECTS, form: str = "") -> Table:
-    """A number of each object, ``rows`` {label: {object: value}}."""
-    columns = [Column(n, n, head, form or ".1f", optional=True) for n, head in zip(OBJECTS, heads, strict=True)]
+def describe_objects(
+    first: str, rows: Mapping[str, Results], heads: Mapping[str, str] | None = None, form: str = ""
+) -> Table:  # fmt: skip
+    """A number of each object, ``rows`` {label: {object: value}}, under ``heads`` {object: head on a page}."""
+    heads = heads or {name: name for name in OBJECTS}
+    columns = [Column(name, name, head, form or ".1f", optional=True) for name, head in heads.items()]
     return Table(first, {"": columns}, {label: {"": row} for label, row in rows.items()})

@@ -107,6 +107,14 @@ def test_seeds_are_a_mean_and_a_std() -> None:
     assert lines == ["| **MMGSD** (ours) | 51.0 ± 1.0 (3) | – |", "| SPCL | 60.0 (1) | – |", "| PCL | – | 70.0 (1) |"]
 
 
+def test_the_error_of_seen_matches_is_of_the_seeds_that_have_it() -> None:
+    seen = {f"mmgsd-{k}": {"rmse_mean": 26.0, "rmse_seen": 22.0 + k} for k in (1, 3)}
+    cloth = {"mmgsd-0": {"rmse_mean": 26.0}} | seen
+    lines = read_page(describe_seeds({"cloth": cloth}, seen=True))
+    assert lines[0] == "| RMSE px: mean ± std (seeds) | cloth | of seen matches | rope | of seen matches |"
+    assert lines[2] == "| **MMGSD** (ours) | 26.0 ± 0.0 (3) | 24.0 ± 1.4 (2) | – | – |"
+
+
 def test_what_seeds_tell_apart_from_mmgsd_is_marked() -> None:
     errors = {"mmgsd": (50.0, 51.0, 52.0), "spcl": (60.0, 61.0, 62.5), "pcl": (49.0, 53.0, 58.0)}
     cloth = {f"{name}-{seed}": {"rmse_mean": e} for name, found in errors.items() for seed, e in enumerate(found)}
