@@ -98,12 +98,19 @@ def test_a_cloth_that_nobody_folded_is_found_again(
     views = {name: looks[name] for name in ("above", "aside")}
     monkeypatch.setattr(folded_twice, "make_folded", lambda *_: {0: Folded(flat, flat, (film, film), views, flat)})
     results = read_json(folded_twice.run(Paths(tmp_path, "smoke"), progress=False))
-    assert results["run"]["cloths"] == 1 and results["run"]["spoilt"] == 0
+    assert results["run"]["cloths"] == 1 and results["run"]["spoilt"] == 0 and results["run"]["hardware"]
     assert all(results[name]["right"]["mean"] == 1 for name in ("one", "possible", "film", "orders"))
-    assert results["orders"]["apart"]["mean"] == 0 and results["orders"]["overlap"]["mean"] == 1
+    assert results["orders"]["distance_px"]["mean"] == 0 and results["orders"]["overlap"]["mean"] == 1
     assert results["outline"]["ways"]["mean"] == 1  # a flat cloth's turns and mirror images are symmetries
     assert len(to_markdown(describe_folded(results)).splitlines()) == 2 + len(LABELS)
     assert make_folded_sentence(results).startswith("1 cloths. Two orders")
+
+
+def test_spoilt_cloths_alone_are_no_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(folded_twice, "make_folded", lambda *_: {})
+    with pytest.raises(ValueError, match="cloths must"):
+        folded_twice.run(Paths(tmp_path, "smoke"), progress=False)
+    assert not list(tmp_path.rglob("*.json"))
 
 
 def test_only_presets_with_a_number_of_cloths_are_folded(tmp_path: Path) -> None:
