@@ -152,7 +152,7 @@ def measure_cloth(matcher: Matcher, cloth: Folded, rng: np.random.Generator) -> 
     answers = {
         "heaviest": alone.modes[:, 0],
         "one": joint.modes[:, 0],
-        "film": matcher.track(film, xy).xy[-1],
+        "film": find_last(matcher.track(film, xy).xy),
         **{name: match_both(matcher, cloth, view, xy) for name, view in cloth.looks.items()},
     }
     rows = {name: score(answer[None], true) for name, answer in answers.items()}
@@ -168,6 +168,13 @@ def measure_cloth(matcher: Matcher, cloth: Folded, rng: np.random.Generator) -> 
     rows["orders"] |= {"overlap": float(overlap), "distance_px": distance}
     rows["outline"] |= {"ways": float(len(ways))}
     return rows
+
+
+def find_last(xy: np.ndarray) -> np.ndarray:
+    """(S, 2) px, where tracks (T, S, 2) have their points last: NaN are frames in which the object is not seen."""
+    known = np.isfinite(xy).all(-1)
+    last = len(xy) - 1 - known[::-1].argmax(0)
+    return xy[last, np.arange(xy.shape[1])]
 
 
 def match_both(matcher: Matcher, cloth: Folded, view: State, xy: np.ndarray) -> np.ndarray:

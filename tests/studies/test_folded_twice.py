@@ -18,6 +18,7 @@ from mmgsd.studies.folded_twice import (
     LABELS,
     Folded,
     describe_folded,
+    find_last,
     lay_onto,
     make_folded_sentence,
     rectify,
@@ -53,6 +54,13 @@ def test_the_best_choice_takes_modes_of_one_member() -> None:
     true = TRUE[MEMBERS]
     modes = np.stack([TRUE[[2, 1, 2]] + (0, 5), TRUE[[0, 1, 0]] + (0, 5)], axis=1)
     assert score_choice(modes, true) == {"right": 1.0, "error": 5.0}
+
+
+def test_a_track_ends_where_its_point_is_known_last() -> None:
+    xy = np.stack([TRUE, TRUE + 1, TRUE + 2])
+    xy[1:, 0] = np.nan
+    xy[2, 1] = np.nan
+    assert find_last(xy).tolist() == [[0, 0], [101, 1], [202, 2]]
 
 
 def test_of_ways_that_are_as_likely_one_is_answered() -> None:
