@@ -42,6 +42,7 @@ FRAMES = 20  # of a film of each of the two folds
 TILT_DEG = 60.0  # from straight down, of the look from aside
 SIDE = 25  # points along a side of the cloth
 LABELS = {
+    "once": "folded once: one picture, first joint answer",
     "heaviest": "one picture, heaviest modes",
     "one": "one picture, first joint answer",
     "possible": "one picture, best choice of modes",
@@ -58,6 +59,7 @@ class Folded:
     """A cloth before, after and between two folds; seen again from above and aside; folded in the other order."""
 
     before: State
+    half: State
     after: State
     films: tuple[State, State]
     looks: Mapping[str, State]
@@ -120,7 +122,7 @@ def make_folded(bench: Bench, count: int, frames: int) -> dict[int, Folded]:
         jobs[f"{seed}-aside"] = look_job(files[f"{seed}-after"], 2, tilt_deg=TILT_DEG)
     states = {name: read_state(file) for name, file in (files | make(jobs)).items()}
     return {
-        seed: Folded(states[f"{seed}-before"], states[f"{seed}-after"],
+        seed: Folded(states[f"{seed}-before"], states[f"{seed}-half"], states[f"{seed}-after"],
                      (states[f"{seed}-film0"], states[f"{seed}-film1"]),
                      {name: states[f"{seed}-{name}"] for name in ("above", "aside")}, states[f"{seed}-other-after"])
         for seed in whole
@@ -157,6 +159,8 @@ def measure_cloth(matcher: Matcher, cloth: Folded, rng: np.random.Generator) -> 
     }
     rows = {name: score(answer[None], true) for name, answer in answers.items()}
     rows["possible"] = score_choice(alone.modes, true)
+    once = matcher.match(cloth.before.image, cloth.half.image, xy, joint=True)
+    rows["once"] = score(once.modes[None, :, 0], cloth.half.xy.astype(float)[members[:, points]])
     orders = [cloth.after.xy.astype(float), lay_onto(cloth.other, cloth.after)]
     orbits = list(members.T)
     ways = list_ways(orders[0], cloth.after.mask, load_mirror("cloth"), orbits)
@@ -258,11 +262,10 @@ def describe_folded(results: Results) -> Table:
 
 def make_folded_sentence(results: Results) -> str:
     """How many cloths there are, and what the orders of folds and the outline leave open."""
-    orders, ways = results["orders"], results["outline"]["ways"]["mean"]
-    overlap, distance = (orders[key]["mean"] for key in ("overlap", "distance_px"))
-    return (f"{results['run']['cloths']} cloths. Two orders of folds end alike: their outlines overlap by "
-            f"{100 * overlap:.0f} %, their matches are {distance:.1f} px from each other. The outline alone fits "
-            f"{ways:.1f} ways round.")  # fmt: skip
+    count, ways = results["run"]["cloths"], results["outline"]["ways"]["mean"]
+    overlap, distance = (results["orders"][key]["mean"] for key in ("overlap", "distance_px"))
+    return (f"{count} cloths. Two orders of folds: outlines overlap by {100 * overlap:.0f} %, matches are "
+            f"{distance:.1f} px apart; an outline fits {ways:.1f} ways round.")  # fmt: skip
 
 
 STUDY = Study(

@@ -215,9 +215,9 @@ def make_films_sentence(results: Results) -> str:
     """What was measured, for beside the table."""
     counts = [f"{results['methods'][object]['track']['all']['films']} films of a {object}" for object in OBJECTS]
     return (f"{' and '.join(counts)}, {results['run']['frames']} frames each: folds, half turns, grippers in front, a "
-            "hand across. δ_avg, occlusion accuracy and average Jaccard are TAP-Vid's, at 256 × 256 px; a swap is a "
-            "point nearer to a like point's true place than to its own, where those are more than 16 px apart; "
-            "at a like point it is within 16 px of that one and not of its own.")
+            "hand across. δ_avg, occlusion accuracy and average Jaccard are TAP-Vid's, at 256 × 256 px; a swap is "
+            "nearer to a like point's place than to its own, where those are over 16 px apart; at a like point is "
+            "within 16 px of that one alone.")
 
 
 @styled
