@@ -42,8 +42,8 @@ FRAMES = 20  # of a film of each of the two folds
 TILT_DEG = 60.0  # from straight down, of the look from aside
 SIDE = 25  # points along a side of the cloth
 LABELS = {
-    "once": "folded once: one picture, first joint answer",
-    "heaviest": "one picture, heaviest modes",
+    "once": "folded once, first joint answer",
+    "heaviest": "twice: one picture, heaviest modes",
     "one": "one picture, first joint answer",
     "possible": "one picture, best choice of modes",
     "above": "and a second one from above",
@@ -249,11 +249,14 @@ def shift_mask(other: State, onto: State) -> np.ndarray:
 
 
 def describe_folded(results: Results) -> Table:
-    """The rows of `LABELS`: right questions and the error, with 95 % intervals over cloths."""
+    """The rows of `LABELS`: right questions and the error, with 95 % intervals over cloths.
+
+    Where all cloths are alike there is no interval.
+    """
 
     def say(estimate: Mapping[str, Any], scale: float, form: str, unit: str) -> str:
         mean, low, high = (format(scale * estimate[key], form) for key in ("mean", "low", "high"))
-        return f"{mean}{unit} ({low} to {high})"
+        return f"{mean}{unit}" + (f" ({low} to {high})" if low != high else "")
 
     lines = {label: [say(results[name]["right"], 100, ".0f", " %"), say(results[name]["error"], 1, ".1f", "")]
              for name, label in LABELS.items()}  # fmt: skip
