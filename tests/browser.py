@@ -107,9 +107,10 @@ def open_explorer(address: str, page: Any = None) -> Iterator[Any]:
         try:
             page.goto(f"{address}/tree/explore.ipynb", timeout=PATIENCE_MS)
             page.locator(".jp-Notebook .jp-CodeCell").first.wait_for(timeout=PATIENCE_MS)
-            page.get_by_text("(ipykernel) | Idle").wait_for(timeout=PATIENCE_MS)  # what is run before is lost
+            # What is run before is lost; a kernel starts beside other tests.
+            page.get_by_text("(ipykernel) | Idle").wait_for(timeout=3 * PATIENCE_MS)
             _run_all(page)
-            page.locator(CANVAS).wait_for(timeout=PATIENCE_MS)
+            page.locator(CANVAS).wait_for(timeout=3 * PATIENCE_MS)
             page.get_by_text("nats").first.wait_for(timeout=PATIENCE_MS)  # the last cell asks about a pixel
         except Error as error:
             shown = page.locator("body").inner_text()[-4000:]
