@@ -49,8 +49,8 @@ LABELS = {
     "above": "and a second one from above",
     "aside": "and a second one from aside",
     "film": "a film of both folds, tracked",
-    "orders": "true matches, order of folds unknown",
-    "outline": "true matches, but for what the outline leaves open",
+    "orders": "all but the order of folds known",
+    "outline": "all but the way round of the outline known",
 }
 
 
@@ -99,9 +99,11 @@ def make_folded(bench: Bench, count: int, frames: int) -> dict[int, Folded]:
     flat = bench.demonstrated[task.name][0].points
 
     def make(jobs: dict[str, dict]) -> dict[str, Path]:
+        """Their states' files by name."""
         return run_jobs(jobs, folder, **bench.how)
 
     def move(task: Task, number: int, file: Path) -> list:
+        """The true moves (px) of one of a task's two folds."""
         return true_moves(task.looks[number], flat, read_state(file))
 
     files = make({f"{seed}-before": start_job(task, "flat", "plain", seed) for seed in seeds})
@@ -133,6 +135,7 @@ def transpose(task: Task) -> Task:
     """The same folds across the cloth's diagonal: in halves by columns first where they were by rows, and so on."""
 
     def turn(move: Move) -> Move:
+        """One move across the diagonal."""
         row, column = divmod(move.pick, SIDE)
         return Move(SIDE * column + row, (-move.place[1], -move.place[0]))
 
@@ -255,6 +258,7 @@ def describe_folded(results: Results) -> Table:
     """
 
     def say(estimate: Mapping[str, Any], scale: float, form: str, unit: str) -> str:
+        """A cell of the table."""
         mean, low, high = (format(scale * estimate[key], form) for key in ("mean", "low", "high"))
         return f"{mean}{unit}" + (f" ({low} to {high})" if low != high else "")
 
