@@ -164,14 +164,14 @@ def measure_cloth(matcher: Matcher, cloth: Folded, rng: np.random.Generator) -> 
     rows["possible"] = score_choice(alone.modes, true)
     once = matcher.match(cloth.before.image, cloth.half.image, xy, joint=True)
     rows["once"] = score(once.modes[None, :, 0], cloth.half.xy.astype(float)[members[:, points]])
-    orders = [cloth.after.xy.astype(float), lay_onto(cloth.other, cloth.after)]
+    laid, shifted = lay_onto(cloth.other, cloth.after)
+    orders = [cloth.after.xy.astype(float), laid]
     orbits = list(members.T)
     ways = list_ways(orders[0], cloth.after.mask, load_mirror("cloth"), orbits)
     for name, candidates in {"orders": orders, "outline": ways}.items():
         rows[name] = score_open(candidates, members, points)
-    shifted = shift_mask(cloth.other, cloth.after)
     overlap = (shifted & cloth.after.mask).sum() / (shifted | cloth.after.mask).sum()
-    distance = score(orders[1][points][None], true)["error"]
+    distance = score(laid[points][None], true)["error"]
     rows["orders"] |= {"overlap": float(overlap), "distance_px": distance}
     rows["outline"] |= {"ways": float(len(ways))}
     return rows
@@ -231,21 +231,12 @@ def score_open(ways: Sequence[np.ndarray], members: np.ndarray, points: np.ndarr
     return min(means, key=lambda mean: mean["error"])
 
 
-def lay_onto(other: State, onto: State) -> np.ndarray:
-    """(P, 2) px, a state's points, shifted as its outline's middle lies beside that of another state."""
-    return other.xy.astype(float) + find_shift(other, onto)
-
-
-def find_shift(other: State, onto: State) -> np.ndarray:
-    """(2,) px from the middle of one outline to the middle of another."""
+def lay_onto(other: State, onto: State) -> tuple[np.ndarray, np.ndarray]:
+    """Points (P, 2) px and outline (H, W) bool of a state, shifted until its middle is that of another one's."""
     middles = [np.argwhere(state.mask)[:, ::-1].mean(0) for state in (other, onto)]
-    return middles[1] - middles[0]
-
-
-def shift_mask(other: State, onto: State) -> np.ndarray:
-    """(H, W) bool, a state's outline shifted as `lay_onto` shifts its points."""
-    warp = np.column_stack([np.eye(2), find_shift(other, onto)])
-    return cv2.warpAffine(other.mask.astype(np.uint8), warp, onto.mask.shape[::-1]) > 0
+    shift = middles[1] - middles[0]
+    mask = cv2.warpAffine(other.mask.astype(np.uint8), np.column_stack([np.eye(2), shift]), onto.mask.shape[::-1]) > 0
+    return other.xy.astype(float) + shift, mask
 
 
 # Tables. ------------------------------------------------------------------------------------------------------------
