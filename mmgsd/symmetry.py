@@ -104,6 +104,18 @@ def load_group(object: str, name: str) -> SymmetryGroup:
     return grid_group(name) if object == "cloth" else line_group(name)
 
 
+def locate_points(object: str, points: int = N_POINTS) -> np.ndarray:
+    """(P, 2) in [0, 1], where material points lie on an object laid flat: a cloth's row by row, a rope's in its middle.
+
+    ValueError for an unknown object.
+    """
+    check_choice("object", object, OBJECTS)
+    if object == "rope":
+        return np.stack([np.linspace(0, 1, points), np.full(points, 0.5)], axis=-1)
+    rows, columns = np.divmod(np.arange(points), side := round(points**0.5))
+    return np.stack([columns, rows], axis=-1) / (side - 1)
+
+
 def load_mirror(object: str) -> np.ndarray:
     """Where each material point (625,) of a ``cloth`` or ``rope`` goes in a mirror image of it, seen from above.
 

@@ -14,6 +14,7 @@ import scipy
 from scipy.spatial import cKDTree
 
 from mmgsd.learn.compositing import crop, draw_colour, draw_things, fill_area
+from mmgsd.symmetry import locate_points
 
 TEXTURE_PX = 160  # side of a texture
 KINDS = ("picture", "filled", "patches", "motifs", "plain")
@@ -24,14 +25,6 @@ DARKEST, BRIGHTEST = 0.15, 1.3  # of the shading
 GLYPHS = [chr(code) for code in range(33, 127)]
 
 Borrow = Callable[[], tuple[np.ndarray, np.ndarray]]
-
-
-def place_on_texture(object: str, points: int) -> np.ndarray:
-    """(P, 2) in [0, 1], where material points lie on a texture: on a cloth row by row, on a rope along its middle."""
-    if object == "rope":
-        return np.stack([np.linspace(0, 1, points), np.full(points, 0.5)], axis=-1)
-    rows, columns = np.divmod(np.arange(points), side := round(points**0.5))
-    return np.stack([columns, rows], axis=-1) / (side - 1)
 
 
 def retexture(
@@ -46,7 +39,7 @@ def retexture(
     rows, columns = mask.nonzero()
     if visible.sum() < 4 or not len(rows):
         return image
-    places = _lay_on(mask, xy[visible], place_on_texture(object, len(xy))[visible], object)
+    places = _lay_on(mask, xy[visible], locate_points(object, len(xy))[visible], object)
     texture = draw_texture(object, borrow, rng)
     colours = cv2.remap(texture, places * (TEXTURE_PX - 1), None, cv2.INTER_LINEAR)[rows, columns]
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)[rows, columns].astype(np.float32)

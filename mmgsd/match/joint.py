@@ -12,10 +12,14 @@ apart to one: that tells which end of a rope is which, as smoothness hardly does
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components, shortest_path
 from scipy.spatial import cKDTree
+
+from mmgsd.match.isometry import compute_odds
 
 PLACES = 64  # spread over the object besides those that are asked about
 QUESTIONS = 128  # that are sorted at a time
@@ -30,6 +34,7 @@ FAR, STEP = 0.35, 0.05  # by the object's extent: where places begin to be far a
 NEAR = 0.1  # by the object's extent: std of what counts as one place of image1
 ROUNDS = 15  # of maps from assigned modes and modes assigned by maps
 STARTS, APART = 4, 5  # places from which assigning starts, each the fifth clearest; the most likely outcome counts
+VOTES, CERTAIN = 10, 50.0  # rounds of graduated assignment; log-odds that a start keeps its modes
 BALANCE = 20  # normalisations of rows and columns in a round
 UNKNOWN = 1e4  # variance of what a place says that is not sure at all, by the squared extent
 
@@ -50,12 +55,15 @@ def spread_places(mask: np.ndarray, count: int = PLACES) -> np.ndarray:
 
 
 def join(
-    xy: np.ndarray, mask: np.ndarray, modes: np.ndarray, weights: np.ndarray, spread: np.ndarray, *, places: int
-) -> np.ndarray:
+    xy: np.ndarray, mask: np.ndarray, modes: np.ndarray, weights: np.ndarray, spread: np.ndarray, *, places: int,
+    located: np.ndarray | None = None,
+) -> np.ndarray:  # fmt: skip
     """Sort the modes (S, n, 2) px of pixels ``xy`` (S, 2), which have ``weights`` and ``spread`` (S, n) px.
 
     The last ``places`` of the pixels are those of `spread_places`: `QUESTIONS` of the others are sorted at a time,
-    together with all of these. ``mask`` (H, W) bool says where image0 shows the object. NaN modes fit anywhere. Returns
+    together with all of these. ``mask`` (H, W) bool says where image0 shows the object. NaN modes fit anywhere.
+    ``located`` (n, S, 2) are where each member takes each pixel's place on the object laid flat (`mmgsd.match.places`);
+    then modes are sorted by distances instead of by the graph (`mmgsd.match.isometry`). Returns
     which mode of each pixel is whose, (S, n), a permutation a pixel; the map comes first whose modes weigh most at the
     places. Where nothing can be told, of one mode or fewer than three pixels, modes keep their order.
     """
@@ -63,7 +71,8 @@ def join(
     chunks = [np.arange(first, min(first + QUESTIONS, count)) for first in range(0, max(count, 1), QUESTIONS)]
     last, orders, common = np.arange(count, len(xy)), [], None
     for rows in (np.concatenate([part, last]) for part in chunks):
-        order = _join(*(values[rows] for values in (xy, modes, weights, spread)), mask)
+        order = _join(*(values[rows] for values in (xy, modes, weights, spread)), mask,
+                      None if located is None else located[:, rows])  # fmt: skip
         if common is None:
             heavy = np.take_along_axis(weights[rows], order, 1)[-places:].sum(0)  # of all, where there are no places
             order = order[:, np.argsort(-heavy, kind="stable")]
@@ -75,7 +84,10 @@ def join(
     return np.concatenate([*orders, common])
 
 
-def _join(xy: np.ndarray, modes: np.ndarray, weights: np.ndarray, spread: np.ndarray, mask: np.ndarray) -> np.ndarray:
+def _join(
+    xy: np.ndarray, modes: np.ndarray, weights: np.ndarray, spread: np.ndarray, mask: np.ndarray,
+    located: np.ndarray | None,
+) -> np.ndarray:  # fmt: skip
     """The order (S, n) that is the most likely of the outcomes that start at several pixels."""
     count, n = weights.shape
     valid = np.isfinite(modes).all(-1)
@@ -83,12 +95,14 @@ def _join(xy: np.ndarray, modes: np.ndarray, weights: np.ndarray, spread: np.nda
         return np.tile(np.arange(n), (count, 1))
     values, variance, _, _ = _scale(modes, spread)
     log_weights = np.log(np.clip(np.nan_to_num(weights), 1e-3, None))
-    edges, length = _measure_edges(xy, mask)
-    kernel = _make_kernel(edges, length, count)
-    ways = shortest_path(coo_matrix((length, edges.T), shape=(count, count)), directed=False)  # by the extent
-    rivals = _find_rivals(ways, values, valid)
-    outcomes = [_assign(kernel, rivals, values, variance, log_weights, start)
-                for start in _choose_starts(values, variance, valid)]  # fmt: skip
+    if located is None:
+        edges, length = _measure_edges(xy, mask)
+        kernel = _make_kernel(edges, length, count)
+        ways = shortest_path(coo_matrix((length, edges.T), shape=(count, count)), directed=False)  # by the extent
+        assign = partial(_assign, kernel, _find_rivals(ways, values, valid), values, variance, log_weights)
+    else:
+        assign = partial(_assign_by_odds, compute_odds(xy, modes, located), log_weights)
+    outcomes = [assign(start) for start in _choose_starts(values, variance, valid)]
     return max(outcomes, key=lambda outcome: outcome[1])[0]
 
 
@@ -199,6 +213,21 @@ def _assign(
         sure = (np.sum(share**2, 1) - 1 / n) / (1 - 1 / n)  # 0 where all modes fit alike
         noise = np.einsum("sag,sag->sg", share, variance[..., None] + scatter) / np.maximum(sure, 0.01) ** 2
     return _round(share), float(np.mean(np.sum(share * np.clip(logits, -50, None), (1, 2))))
+
+
+def _assign_by_odds(odds: np.ndarray, log_weights: np.ndarray, start: int) -> tuple[np.ndarray, float]:
+    """The same from the log-odds (S n, S n) of `compute_odds`; instead of a likelihood the sum of them within maps."""
+    count, n = log_weights.shape
+    share = np.full((count, n, n), 1 / n)  # (S, mode, map)
+    share[start] = np.eye(n)
+    for _ in range(VOTES):
+        sure = (np.sum(share**2, 1, keepdims=True) - 1 / n) / (1 - 1 / n)  # 0 where all modes fit alike
+        logits = (odds @ (share * sure).reshape(-1, n)).reshape(share.shape) + log_weights[..., None]
+        logits[start] = CERTAIN * (2 * np.eye(n) - 1)
+        share = _balance(logits)
+    order = _round(share)
+    chosen = (order[:, None] == np.arange(n)[:, None]).astype(float).reshape(-1, n)  # (S mode, map)
+    return order, float(np.sum(chosen * (odds @ chosen)))
 
 
 def _predict(kernel: np.ndarray, observed: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -20,7 +20,7 @@ from mmgsd.match.heatmap import check_scales, compute_heatmap
 from mmgsd.match.match import Match
 from mmgsd.match.mixture import check_modes
 from mmgsd.match.pair import Pair
-from mmgsd.match.places import Flat, Place, lay_flat, shrink_sources
+from mmgsd.match.places import Flat, Place, lay_flat, locate, shrink_sources
 from mmgsd.model.calibration import Calibration
 from mmgsd.model.heads import Outputs, weigh_cells
 from mmgsd.model.network import compute_squared_distances, find_device, fit_input_size, sample_descriptors
@@ -182,6 +182,17 @@ class Matcher:
         if not shrink or self.places is None or not self.shrinkage:
             return sampled
         return shrink_sources(sampled, self.places.to(sampled), self.shrinkage, bandwidth=self.bandwidth)
+
+    def locate(self, outputs0: Outputs, xy: Tensor, size: tuple[int, int]) -> np.ndarray | None:
+        """(G, S, 2) in [0, 1], where each member of the symmetry takes pixels ``xy`` (S, 2) on the object laid flat.
+
+        As `mmgsd.match.places.locate`; of an image of ``size`` (width, height). None of weights that do not know their
+        places, and of objects of which is not known how these lie beside each other.
+        """
+        if self.places is None or self.object not in OBJECTS:
+            return None
+        sources = self.sample_sources(outputs0, xy, size)[0]
+        return locate(sources, self.places.to(sources), self.object, self.config.group, bandwidth=self.bandwidth)
 
     def match(
         self, image0: Any, image1: Any, xy: Any, *, n: Any = None, mask0: Any = None, mask1: Any = None,

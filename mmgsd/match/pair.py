@@ -61,7 +61,9 @@ class Pair:
         mask = self._find_mask()
         places = spread_places(mask)
         match = self._match(np.concatenate([points, places.astype(points.dtype)]), None, merge=False)
-        return match, join(match.xy, mask, match.modes, match.weights, match.spread_px, places=len(places))
+        located = self.matcher.locate(self.outputs[0], torch.from_numpy(match.xy), self.image0.shape[1::-1])
+        return match, join(match.xy, mask, match.modes, match.weights, match.spread_px, places=len(places),
+                           located=located)  # fmt: skip
 
     def _find(self, places: Any, n: Any, joint: bool) -> Match:
         flat, xy, counts = self.matcher.look_up_places(places, joint=joint)

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from mmgsd.config import N_POINTS, OBJECTS
 from mmgsd.model.heads import Outputs
-from mmgsd.symmetry import load_group
+from mmgsd.symmetry import load_group, locate_points
 
 SIDE = round(N_POINTS**0.5)
 NAMES = {  # of a place and all that look like it: one of its material points
@@ -25,6 +25,7 @@ NAMES = {  # of a place and all that look like it: one of its material points
 }
 CLOTH_CELL_PX, LINE_PX = 16, 16  # of a flat picture: a cell of a cloth's; the height of any other's
 PLACE_TEMPERATURE = 0.1  # of the heatmap over places, so low that mostly one counts
+BESIDE = 0.05  # on an object laid flat: places that a pixel may lie between
 GROUND, OBJECT, EDGE = 235, 170, 90  # grey levels
 
 
@@ -96,9 +97,27 @@ def shrink_sources(sources: Tensor, places: Tensor, shrinkage: float, *, bandwid
     between some that are about as near: to their mean by a heatmap over the places at `PLACE_TEMPERATURE`. The
     ``shrinkage``, 0 to 1, is chosen on renders (`mmgsd.measure.calibration.choose_shrinkage`).
     """
-    squared = torch.cdist(sources, places) ** 2
-    like = torch.softmax(-squared / (PLACE_TEMPERATURE * (1 if bandwidth is None else 2 * bandwidth**2)), -1)
-    return torch.lerp(sources, like @ places, shrinkage)
+    return torch.lerp(sources, torch.softmax(_score_places(sources, places, bandwidth), -1) @ places, shrinkage)
+
+
+def locate(
+    sources: Tensor, places: Tensor, object: str, group: str, *, bandwidth: float | None = None
+) -> np.ndarray:  # fmt: skip
+    """(G, S, 2) in [0, 1], where each member of a cloth's or rope's symmetry takes pixels described so (S, D).
+
+    On the object laid flat (`locate_points`): what ``places`` (P, D) are described as says where each pixel lies, up to
+    the symmetry. That is the place which is the likeliest, and those beside it as far as they are likely, too.
+    """
+    points, scores = locate_points(object), _score_places(sources, places, bandwidth)
+    at = torch.from_numpy(points).to(scores)
+    beside = torch.cdist(at, at)[scores.argmax(-1)] < BESIDE
+    like = torch.softmax(scores.masked_fill(~beside, -torch.inf), -1).cpu().numpy()
+    return like @ points[load_group(object, group).permutations]
+
+
+def _score_places(sources: Tensor, places: Tensor, bandwidth: float | None) -> Tensor:
+    """(..., S, P) logits of descriptors (..., S, D) over the object's places (P, D)."""
+    return -(torch.cdist(sources, places) ** 2) / (PLACE_TEMPERATURE * (1 if bandwidth is None else 2 * bandwidth**2))
 
 
 def lay_flat(descriptors: Tensor, object: str, group: str) -> Flat:

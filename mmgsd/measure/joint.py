@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from mmgsd.config import DEFAULT_GROUP, EvaluateConfig
+from mmgsd.config import DEFAULT_GROUP, OBJECTS, EvaluateConfig
 from mmgsd.dataset import Dataset, load_dataset
 from mmgsd.match.joint import PLACES, join
 from mmgsd.match.match import RADIUS_PX, Match
@@ -27,6 +27,7 @@ from mmgsd.measure.questions import draw_pairs
 from mmgsd.model.network import name_hardware
 from mmgsd.paths import Paths
 from mmgsd.progress import ProgressBar
+from mmgsd.symmetry import locate_points
 
 SETS = ("paper", "workspace")  # presets whose test images are asked about
 PAIRS, QUESTIONS, POINTS = 200, 3, 3  # pairs of images, questions about each, points of a question
@@ -74,7 +75,8 @@ def sort_true_matches(
 ) -> np.ndarray:
     """(S, n, 2) px, the true matches of material ``points`` (S,), shuffled and then sorted by `join`.
 
-    The places that it is helped by are further points that the first image shows.
+    The places that it is helped by are further points that the first image shows; of each it is told where it lies on
+    a cloth or rope.
     """
     first, second = pair
     others = np.setdiff1d(np.flatnonzero(data.visible[first]), points)
@@ -84,7 +86,8 @@ def sort_true_matches(
     true = np.take_along_axis(true, rng.random(true.shape[:2]).argsort(1)[..., None], 1)
     even = np.full(true.shape[:2], 1 / true.shape[1])
     xy, spread = data.xy[first, numbers].astype(float), np.ones_like(even)
-    order = join(xy, data.load_mask(first), true, even, spread, places=len(places))
+    located = locate_points(data.object)[_list_members(data)[:, numbers]] if data.object in OBJECTS else None
+    order = join(xy, data.load_mask(first), true, even, spread, places=len(places), located=located)
     return np.take_along_axis(true, order[..., None], 1)[: len(points)]
 
 

@@ -14,7 +14,8 @@ from mmgsd.dataset import load_dataset
 from mmgsd.learn import augmentation, texturing
 from mmgsd.learn.augmentation import Warp, make_batch, sample_warp, warp_images
 from mmgsd.learn.compositing import composite, draw_things
-from mmgsd.learn.texturing import draw_texture, place_on_texture, retexture
+from mmgsd.learn.texturing import draw_texture, retexture
+from mmgsd.symmetry import locate_points
 
 SHAPE = (96, 128)
 
@@ -25,7 +26,7 @@ def cloth() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     mask = np.zeros(SHAPE, np.uint8)
     mask[20:81, 30:91] = 255
     image = np.where(mask[..., None] > 0, np.uint8([150, 150, 150]), np.uint8([200, 0, 0]))
-    return image, mask, place_on_texture("cloth", 625) * 60 + (30, 20)
+    return image, mask, locate_points("cloth", 625) * 60 + (30, 20)
 
 
 def borrow() -> tuple[np.ndarray, np.ndarray]:
@@ -33,7 +34,7 @@ def borrow() -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_points_lie_on_a_print_as_they_do_on_the_object() -> None:
-    cloth, rope = place_on_texture("cloth", 625), place_on_texture("rope", 625)
+    cloth, rope = locate_points("cloth", 625), locate_points("rope", 625)
     assert cloth[[0, 24, 600, 624]].tolist() == [[0, 0], [1, 0], [0, 1], [1, 1]]
     assert rope[[0, 312, 624], 0].tolist() == [0, 0.5, 1] and (rope[:, 1] == 0.5).all()
 
