@@ -22,7 +22,7 @@ from mmgsd.studies.models import configure_model, get_colour
 from mmgsd.symmetry import load_group
 
 TRAINED_BY = "quick"  # preset whose models of an equal, small budget are compared
-VERSION = 3  # to be raised where a policy answers the same question otherwise than before
+VERSION = 4  # to be raised where a policy answers the same question otherwise than before
 
 
 @dataclass(frozen=True)
