@@ -1,13 +1,15 @@
 """One answer for a whole question: which of the modes of several pixels belong to the same member of the symmetry.
 
 Each pixel has as many matches as the symmetry has members, in an order that no other pixel shares. Over the whole
-object they are n smooth maps from image0 to image1, one a member, and a place's modes are their values, shuffled.
-`join` sorts them. Places spread over the object in image0 are nodes of a graph of what lies side by side on it; each
-map is a Gaussian process on that graph (Borovitskiy et al., "Matérn Gaussian processes on graphs", AISTATS 2021); and
-modes are given to maps, one to each, as overlapping mixtures of Gaussian processes are fitted (Lázaro-Gredilla, Van
-Vaerenbergh and Lawrence, Pattern Recognition 2012): from one place where they lie clear of each other to its
-neighbours, and so on. A place whose modes fit several maps alike says little to others. A map takes no two places far
-apart to one: that tells which end of a rope is which, as smoothness hardly does where both maps cross in its middle.
+object they are n maps from image0 to image1, one a member, and a place's modes are their values, shuffled. `join`
+sorts them, together with those of places spread over the object in image0. Of a cloth or a rope by how far apart places
+lie on it (`mmgsd.match.isometry`). Of other objects, and by weights that do not know their places, by how smooth maps
+are: places are nodes of a graph of what lies side by side; each map is a Gaussian process on that graph (Borovitskiy et
+al., "Matérn Gaussian processes on graphs", AISTATS 2021); and modes are given to maps, one to each, as overlapping
+mixtures of Gaussian processes are fitted (Lázaro-Gredilla, Van Vaerenbergh and Lawrence, Pattern Recognition 2012):
+from one place where they lie clear of each other to its neighbours, and so on. A place whose modes fit several maps
+alike says little to others. A map takes no two places far apart to one: that tells which end of a rope is which, as
+smoothness hardly does where both maps cross in its middle.
 """
 
 from __future__ import annotations
