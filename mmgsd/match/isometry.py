@@ -39,15 +39,15 @@ def compute_odds(xy: np.ndarray, modes: np.ndarray, places: np.ndarray) -> np.nd
     least = between.min(0)
     near = np.flatnonzero(least < NEAR) if (least < NEAR).any() else np.arange(len(one))
     near = near[:: -(-len(near) // LENGTH_PAIRS)]
-    apart0 = np.linalg.norm(xy[one] - xy[other], axis=-1)[:, None, None]  # (E, 1, 1)
-    apart1 = np.linalg.norm(values[one][:, :, None] - values[other][:, None], axis=-1)  # (E, n, n)
-    likely = [
-        _weigh_members(apart, between, length)
-        for apart, length in (
-            (apart0, _choose_length(apart0[near], between[:, near], _measure_extent(xy))),
-            (apart1, _choose_length(apart1[near], between[:, near], _measure_extent(modes[valid]))),
-        )
-    ]
+    between = between[..., None, None]
+    likely = []
+    for points, apart in (
+        (xy, np.linalg.norm(xy[one] - xy[other], axis=-1)[:, None, None]),
+        (modes[valid], np.linalg.norm(values[one][:, :, None] - values[other][:, None], axis=-1)),  # (E, n, n)
+    ):
+        length = _choose_length(apart[near], between[:, near], _measure_extent(points))
+        density = _compute_density(apart / length, between)
+        likely.append(density / density.sum(0))  # (n, E, ...) of each member to be the one between the pair
     same = np.sum(likely[0] * likely[1], 0)  # (E, n, n)
     odds = np.log(same + DOUBT) - np.log((1 - same) / max(n - 1, 1) + DOUBT)
     odds *= np.exp(-least / RELIABLE)[:, None, None] * (valid[one][:, :, None] & valid[other][:, None])
@@ -64,18 +64,11 @@ def _measure_extent(points: np.ndarray) -> float:
 def _choose_length(apart: np.ndarray, between: np.ndarray, extent: float) -> float:
     """How many px the object is long in an image where pairs are ``apart`` (E, ...) px, the likeliest of `LENGTHS`.
 
-    By the mean over the members that they may lie ``between`` (n, E) on the object.
+    By the mean over the members, of which each says how far they are ``between`` (n, E, 1, 1) on the object.
     """
-    between = between.reshape(*between.shape, *(1,) * (apart.ndim - 1))
     lengths = extent * LENGTHS
     fit = [np.log(_compute_density(apart / length, between).mean(0) / length).mean() for length in lengths]
     return float(lengths[int(np.argmax(fit))])
-
-
-def _weigh_members(apart: np.ndarray, between: np.ndarray, length: float) -> np.ndarray:
-    """(n, E, ...) how likely each member is the one between pairs (E, ...) px apart; sums to 1 over members."""
-    density = _compute_density(apart / length, between.reshape(*between.shape, *(1,) * (apart.ndim - 1)))
-    return density / density.sum(0)
 
 
 def _compute_density(apart: np.ndarray, between: np.ndarray) -> np.ndarray:
