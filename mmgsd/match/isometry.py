@@ -45,7 +45,7 @@ def compute_odds(xy: np.ndarray, modes: np.ndarray, places: np.ndarray) -> np.nd
         (xy, np.linalg.norm(xy[one] - xy[other], axis=-1)[:, None, None]),
         (modes[valid], np.linalg.norm(values[one][:, :, None] - values[other][:, None], axis=-1)),  # (E, n, n)
     ):
-        length = _choose_length(apart[near], between[:, near], _measure_extent(points))
+        length = _choose_length(apart[near], between[:, near], measure_extent(points))
         density = _compute_density(apart / length, between)
         likely.append(density / density.sum(0))  # (n, E, ...) of each member to be the one between the pair
     same = np.sum(likely[0] * likely[1], 0)  # (E, n, n)
@@ -56,7 +56,7 @@ def compute_odds(xy: np.ndarray, modes: np.ndarray, places: np.ndarray) -> np.nd
     return table.reshape(count * n, count * n)
 
 
-def _measure_extent(points: np.ndarray) -> float:
+def measure_extent(points: np.ndarray) -> float:
     """Root mean square (px) of points (K, 2) from their middle."""
     return max(float(np.sqrt(np.mean(np.sum((points - points.mean(0)) ** 2, -1)))), 1e-6)
 

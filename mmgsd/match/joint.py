@@ -21,7 +21,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components, shortest_path
 from scipy.spatial import cKDTree
 
-from mmgsd.match.isometry import compute_odds
+from mmgsd.match.isometry import compute_odds, measure_extent
 
 PLACES = 64  # spread over the object besides those that are asked about
 QUESTIONS = 128  # that are sorted at a time
@@ -122,7 +122,7 @@ def _scale(modes: np.ndarray, spread: np.ndarray) -> tuple[np.ndarray, np.ndarra
     """Modes from their middle, and variances, both by the object's extent; that middle and extent (px)."""
     valid = np.isfinite(modes).all(-1)
     middle = modes[valid].mean(0)
-    extent = max(float(np.sqrt(np.mean(np.sum((modes[valid] - middle) ** 2, -1)))), 1e-6)
+    extent = measure_extent(modes[valid])
     values = np.where(valid[..., None], (modes - middle) / extent, 0.0)
     return values, np.where(valid, (np.nan_to_num(spread) / extent) ** 2 + NOISE**2, 4.0), middle, extent
 
@@ -131,8 +131,7 @@ def _measure_edges(xy: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.nda
     """Pairs (E, 2) of near places, and how far apart they lie, by the object's extent."""
     edges = _list_edges(xy, mask)
     length = np.linalg.norm(xy[edges[:, 0]] - xy[edges[:, 1]], axis=1)
-    extent = max(float(np.sqrt(np.mean(np.sum((xy - xy.mean(0)) ** 2, -1)))), 1e-6)
-    return edges, np.maximum(length, 1e-6) / extent
+    return edges, np.maximum(length, 1e-6) / measure_extent(xy)
 
 
 def _make_kernel(edges: np.ndarray, length: np.ndarray, count: int) -> np.ndarray:
