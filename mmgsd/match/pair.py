@@ -53,18 +53,16 @@ class Pair:
         return sort_modes(match[: len(points)], order[: len(points), :count], heavy[:count])
 
     @own_numerics()
-    def match_everywhere(self, points: np.ndarray, *, by_distance: bool = True) -> tuple[Match, np.ndarray]:
+    def match_everywhere(self, points: np.ndarray) -> tuple[Match, np.ndarray]:
         """The answer to pixels (S, 2) of image0, then to places all over the object, and whose modes are whose.
 
         That is an order (S + P, n) of each one's modes: its columns are members of the symmetry (`join`). It is told by
-        distances on the object where these are known, unless ``by_distance`` is false.
+        distances on the object where these are known.
         """
         mask = self._find_mask()
         places = spread_places(mask)
         match = self._match(np.concatenate([points, places.astype(points.dtype)]), None, merge=False)
-        located = None
-        if by_distance:
-            located = self.matcher.locate(self.outputs[0], torch.from_numpy(match.xy), self.image0.shape[1::-1])
+        located = self.matcher.locate(self.outputs[0], torch.from_numpy(match.xy), self.image0.shape[1::-1])
         return match, join(match.xy, mask, match.modes, match.weights, match.spread_px, places=len(places),
                            located=located)  # fmt: skip
 

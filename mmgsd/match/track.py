@@ -113,7 +113,7 @@ class Tracker:
 
     def _begin(self, pair: Pair) -> None:
         """Where the points of the first picture lie there is known."""
-        match, order = pair.match_everywhere(self._points, by_distance=False)
+        match, order = pair.match_everywhere(self._points)
         if match.absent is not None and match.absent[0] > LIKELY or len(match) == len(self._points):
             raise ValueError("image0 must show the object, none is seen in it: begin with another frame, or give mask0")
         if match.on_object is not None:
@@ -133,7 +133,7 @@ class Tracker:
         self._frames += 1
         pair = self._prepare(image, mask)
         self._motion = self._motion or _Motion(compute_scale(pair.image1.shape[1::-1], self._matcher.size))
-        match, order = pair.match_everywhere(self._points, by_distance=False)
+        match, order = pair.match_everywhere(self._points)
         absent = 0.0 if match.absent is None else float(match.absent[0])
         if absent > LIKELY:
             self._motion.forget()

@@ -51,7 +51,7 @@ def follow(monkeypatch: pytest.MonkeyPatch) -> Iterator:
 
     def run(answers: list) -> Track:
         pairs = (SimpleNamespace(image0=match.image0, image1=match.image1, outputs=(None,), mask0=None,
-                                 match_everywhere=lambda _, answer=(match, order), **how: answer)
+                                 match_everywhere=lambda _, answer=(match, order): answer)
                  for match, order in [answers[0], *answers])  # fmt: skip
         matcher = SimpleNamespace(prepare=lambda *_, **__: next(pairs), size=(200, 200))
         monkeypatch.setattr(Tracker, "_prepare", lambda *_: next(pairs))
