@@ -38,12 +38,17 @@ STAMP := .venv/.installed
 SITE := .venv/docs
 PYTEST := OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(PY) -m pytest --numprocesses $(JOBS) --dist loadfile --no-loadscope-reorder
 # run_all would run every notebook a second time: a test in tests/ runs it through papermill.
-NOTEBOOKS := --nbval --nbval-current-env --nbval-cell-timeout=600 --nbval-sanitize-with=tests/nbval_sanitize.cfg \
-	$(wildcard notebooks/[01]*.ipynb) notebooks/explore.ipynb $(wildcard notebooks/your_*.ipynb)
+NOTEBOOKS := $(wildcard notebooks/[01]*.ipynb) notebooks/explore.ipynb $(wildcard notebooks/your_*.ipynb)
+NBVAL := --nbval --nbval-current-env --nbval-cell-timeout=600 --nbval-sanitize-with=tests/nbval_sanitize.cfg
+# What differs from machine to machine is left out: the time of each cell, and the versions of Python and of tools.
+NBCONVERT := $(PY) -m jupyter nbconvert --to notebook --execute --inplace --log-level=ERROR \
+	--ExecutePreprocessor.record_timing=False --ClearMetadataPreprocessor.enabled=True \
+	--ClearMetadataPreprocessor.clear_cell_metadata=False \
+	"--ClearMetadataPreprocessor.preserve_nb_metadata_mask={'kernelspec', ('language_info', 'name')}"
 PAPERMILL := $(PY) -m papermill --kernel python3
 
-.PHONY: help .venv reproduce smoke test lint unit notebooks-test figures paper readme docs weights data-sample \
-	lab lock docs-lock clean clean-all force
+.PHONY: help .venv reproduce smoke test lint unit notebooks-test notebooks-store figures paper readme docs weights \
+	data-sample lab lock docs-lock clean clean-all force
 
 help: ## List the targets
 	@grep -hE '^[.a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | awk -F'\t' '{ printf "  make %-15s %s\n", $$1, $$2 }'
@@ -55,7 +60,7 @@ smoke: $(STAMP) ## The same with the preset smoke: every stage, tiny
 	$(PY) -m mmgsd reproduce smoke
 
 test: lint ## Every check: lint, and in one run what unit and notebooks-test run
-	$(PYTEST) tests $(NOTEBOOKS)
+	$(PYTEST) tests $(NBVAL) $(NOTEBOOKS)
 
 lint: $(STAMP) ## Check the style with ruff
 	$(PY) -m ruff check .
@@ -64,7 +69,10 @@ unit: $(STAMP) ## Run the tests in tests/
 	$(PYTEST) tests
 
 notebooks-test: $(STAMP) ## Run the notebooks and compare their outputs with the committed ones
-	$(PYTEST) $(NOTEBOOKS)
+	$(PYTEST) $(NBVAL) $(NOTEBOOKS)
+
+notebooks-store: $(STAMP) ## Run the notebooks and store their outputs, after results changed
+	$(NBCONVERT) $(NOTEBOOKS)
 
 figures: $(STAMP) ## Draw the paper's figures of PRESET (paper) again from data/results, without training
 	@mkdir -p data/generated

@@ -1,4 +1,4 @@
-"""Notebooks import little and have short cells."""
+"""Notebooks import little, have short cells, and show the figures that they draw."""
 
 from __future__ import annotations
 
@@ -22,3 +22,12 @@ def test_a_notebook_imports_little_and_has_short_cells(path: Path) -> None:
             if (getattr(node, "module", None) or alias.name).startswith("mmgsd")]  # fmt: skip
     assert len(ours) <= NAMES
     assert max(len(source.splitlines()) for source in sources) <= LINES
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_stored_figure_is_a_picture(path: Path) -> None:
+    shown = [output["data"] for cell in json.loads(path.read_text("utf-8"))["cells"]
+             for output in cell.get("outputs", []) if "data" in output]  # fmt: skip
+    for data in shown:
+        if "".join(data.get("text/plain", "")).startswith("<Figure"):
+            assert any(kind.startswith("image/") for kind in data)
