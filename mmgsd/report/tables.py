@@ -57,7 +57,8 @@ def sum_minutes(results: Results, claim: Claim) -> str:
     if claim.runs:
         rows = results.get(claim.runs, {})
         parts = [rows[name] for name in OBJECTS if name in rows] or [rows]
-        runs = [row.get("run") for part in parts for row in part.values()]
+        runs = [row.get("run") for part in parts for key, row in part.items()
+                if not claim.models or key.rpartition("-")[0] in claim.models]  # fmt: skip
     minutes = [run["minutes"] for run in runs if run]
     return f"{sum(minutes):.0f}" if minutes else "–"
 

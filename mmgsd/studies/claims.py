@@ -27,7 +27,7 @@ class Claim:
     parts: tuple[bool | None, ...]
     command: str = ""  # that repeats it; "" is the study's notebook
     models: tuple[str, ...] = ()  # rows of runs.json whose minutes it took
-    runs: str = ""  # instead of these: the results file whose rows say what they took
+    runs: str = ""  # instead: the results file that says what its rows took, all of them or all seeds of ``models``
 
     @property
     def verdict(self) -> str:

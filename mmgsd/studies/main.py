@@ -34,6 +34,7 @@ from mmgsd.studies.models import CHANCE_STYLES, PAPER, configure_study, get_labe
 from mmgsd.studies.parameters import Reader, among, check_images, check_made, listed
 from mmgsd.studies.registry import ERROR_MEASURES, Finding, Results, Shown, Study
 from mmgsd.studies.sample import load_sample, load_shipped
+from mmgsd.studies.seeds import MORE, SEEDS, average_seeds, tell_apart
 from mmgsd.studies.table import LABELS, Table, describe_errors, describe_objects
 
 IMPROVEMENT = 0.477  # on SPCL, as the paper reports it
@@ -122,52 +123,66 @@ def describe_presets(results: Mapping[str, Results]) -> Table:
 
 def judge_rmse(results: Results, *, row: str = "mmgsd_plain") -> Claim:
     """The paper's headline errors, of the paper's own loss alone."""
-    errors = {name: get(results, "rmse", name, row, "rmse_mean") for name in OBJECTS}
+    rows, seeds = _read_errors(results, row)
+    errors = {name: get(rows, name, row, "rmse_mean") for name in OBJECTS}
     parts = tuple(is_at_least(PAPER[name], errors[name]) for name in OBJECTS)
     claim = " and ".join(f"{PAPER[name]} px on {name}" for name in OBJECTS)
     plain = row == "mmgsd_plain"
     return Claim(
         "rmse" if plain else "rmse-dense", f"MMGSD's error is {claim}; here with {OURS[row]}.",
-        "Ours is no larger; a part each object.", f"{list_errors(errors)}, one seed", parts,
-        ALL if plain else "`03_train`, `04_evaluate`", (row,),
+        "Ours is no larger; a part each object.", f"{list_errors(errors)}, {seeds}", parts,
+        models=(row,), **_say_runs(seeds, ALL if plain else "`03_train`, `04_evaluate`"),
     )  # fmt: skip
 
 
 def judge_better(results: Results) -> Claim:
     """Whether it errs less than the contrastive baseline, neither with dense supervision; other pairs beside."""
-    gains = _list_gains(results, "mmgsd_plain", "spcl")
+    gains, seeds = _list_gains(results, "mmgsd_plain", "spcl")
+    budget = {name: _compute_gain(get(results, "budget", name), "mmgsd_plain", "spcl") for name in OBJECTS}
     others = {
-        "the same at the studies' budget": _list_gains(results, "mmgsd_plain", "spcl", "budget"),
+        "the same at the studies' budget": (budget, "one seed"),
         "both with dense supervision": _list_gains(results, "mmgsd", "spcl_dense"),
         "MMGSD alone with it": _list_gains(results, "mmgsd", "spcl"),
     }
-    beside = "".join(f"; {other}: {list_shares(row)}" for other, row in others.items() if any(row.values()))
+    beside = "".join(f"; {other}: {list_shares(row)}, {count}" for other, (row, count) in others.items()
+                     if any(row.values()))  # fmt: skip
     return Claim(
         "better", "MMGSD's error is below SPCL's; here each with its own loss alone.",
-        f"It is by {100 * MARGIN:.0f} % or more, a part each object; three seeds tell it from chance, a part not "
-        "measured.",
-        f"{list_shares(gains)}{beside}; one seed each",
-        (*(is_at_least(each, MARGIN) for each in gains.values()), None),
-        ALL, ("mmgsd_plain", "mmgsd", "spcl", "spcl_dense"),
+        f"It is by {100 * MARGIN:.0f} % or more, a part each object; three seeds tell it from chance on both, a part.",
+        f"{list_shares(gains)}, {seeds}{beside}",
+        (*(is_at_least(each, MARGIN) for each in gains.values()), tell_apart(results, "spcl")),
+        models=("mmgsd_plain", "mmgsd", "spcl", "spcl_dense"), **_say_runs(seeds, ALL),
     )  # fmt: skip
 
 
 def judge_improvement(results: Results) -> Claim:
     """The paper's number for that distance."""
-    gains = _list_gains(results, "mmgsd_plain", "spcl")
+    gains, seeds = _list_gains(results, "mmgsd_plain", "spcl")
     mean = None if None in gains.values() else sum(gains.values()) / len(gains)
     return Claim(
         "improvement",
         f"MMGSD's error is {100 * IMPROVEMENT:.1f} % below SPCL's on average; here each with its own loss alone.",
         "MMGSD's mean improvement over the objects is as large.",
-        f"{list_shares(gains)}, mean {say(mean, 'percent')}; one seed each", (is_at_least(mean, IMPROVEMENT),),
-        ALL, ("mmgsd_plain", "spcl"),
+        f"{list_shares(gains)}, mean {say(mean, 'percent')}; {seeds}", (is_at_least(mean, IMPROVEMENT),),
+        models=("mmgsd_plain", "spcl"), **_say_runs(seeds, ALL),
     )  # fmt: skip
 
 
-def _list_gains(results: Results, row: str, other: str, table: str = "rmse") -> dict[str, float | None]:
-    """By how much the error of one row is below the other's, of each object."""
-    return {name: _compute_gain(get(results, table, name), row, other) for name in OBJECTS}
+def _read_errors(results: Results, *rows: str) -> tuple[Results, str]:
+    """{object: {row: errors}} of some rows, means over seeds where all have enough, and of how many seeds they are."""
+    means = average_seeds(results, *rows)
+    return (means, MORE) if means else (results.get("rmse", {}), "one seed")
+
+
+def _say_runs(seeds: str, command: str) -> dict[str, str]:
+    """What repeats a claim's numbers, and the results file that says what it took, of so many ``seeds``."""
+    return {"command": f"{ALL[:-1]} --seeds {SEEDS}`", "runs": "seeds"} if seeds == MORE else {"command": command}
+
+
+def _list_gains(results: Results, row: str, other: str) -> tuple[dict[str, float | None], str]:
+    """By how much the error of one row is below the other's, of each object, and of how many seeds (`_read_errors`)."""
+    errors, seeds = _read_errors(results, row, other)
+    return {name: _compute_gain(errors.get(name), row, other) for name in OBJECTS}, seeds
 
 
 def _compute_gain(methods: Mapping[str, Any] | None, method: str, other: str) -> float | None:
@@ -175,17 +190,19 @@ def _compute_gain(methods: Mapping[str, Any] | None, method: str, other: str) ->
     return None if ours is None or theirs is None else 1 - ours / theirs
 
 
-def _say_gains(results: Results, method: str, other: str) -> str:
-    return " and ".join(f"{100 * gain:.0f} %" for gain in _list_gains(results, method, other).values())
-
-
 def count_findings(results: Results) -> dict[str, str]:
     """The numbers of the study's findings."""
-    more = max(-gain for gain in _list_gains(results, "unimodal", "mmgsd").values())
+
+    def say_gains(row: str, other: str) -> dict[str, str]:
+        """By how much an error is below another's, and of how many seeds."""
+        gains, seeds = _list_gains(results, row, other)
+        return {"gain": " and ".join(f"{100 * gain:.0f} %" for gain in gains.values()), "seeds": seeds}
+
+    told_one, seeds = _list_gains(results, "unimodal", "mmgsd")
     return {
-        "gain": _say_gains(results, "mmgsd_plain", "spcl"),
-        "dense": _say_gains(results, "mmgsd", "spcl_dense"),
-        "unimodal": f"{100 * more:.0f} %",
+        **say_gains("mmgsd_plain", "spcl"),
+        **{f"dense_{key}": text for key, text in say_gains("mmgsd", "spcl_dense").items()},
+        "unimodal": f"{-100 * min(told_one.values()):.0f} %", "unimodal_seeds": seeds,
     }  # fmt: skip
 
 
@@ -314,12 +331,13 @@ STUDY = Study(
     },
     claims=(judge_rmse, partial(judge_rmse, row="mmgsd"), judge_better, judge_improvement),
     findings=(
-        Finding(1, "The paper's own loss", " errs {gain} less than SPCL on cloth and rope, one seed.",
+        Finding(1, "The paper's own loss", " errs {gain} less than SPCL on cloth and rope, {seeds}.",
                 "which-method-is-best", count_findings),
-        Finding(2, "With dense supervision", " on both sides MMGSD errs {dense} less than SPCL.",
+        Finding(2, "With dense supervision", " on both sides MMGSD errs {dense_gain} less than SPCL, {dense_seeds}.",
                 "which-method-is-best", count_findings),
         Finding(4, "Telling all matches",
-                " helps little where any pose is as probable: told one, Unimodal has {unimodal} more error at most.",
+                " helps little where any pose is as probable: told one, Unimodal has {unimodal} more error at most, "
+                "{unimodal_seeds}.",
                 "which-method-is-best", count_findings),
     ),
     compared=ERROR_MEASURES,

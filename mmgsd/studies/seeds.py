@@ -16,6 +16,7 @@ from mmgsd.studies.registry import Finding, Results, Shown, Study
 from mmgsd.studies.table import LABELS, Table, describe_objects
 
 SEEDS = 3  # from which a spread over seeds is spoken of
+MORE = "three seeds"  # as sentences say it
 LEVEL = 0.05  # of p, from which seeds do not tell two methods apart
 SAME_SUPERVISION = {  # method: MMGSD with its supervision, dense by single images or not
     **dict.fromkeys(("spcl", "spcl_hidden", "pcl"), "mmgsd_plain"),
@@ -73,6 +74,32 @@ def compare_seeds(results: Mapping[Any, Results], others: Mapping[str, str] | No
     return {key: (p, corrected[key]) for key, p in alone.items()}
 
 
+def average_seeds(results: Results, *methods: str) -> dict[str, dict[str, dict[str, float]]]:
+    """{object: {method: {"rmse_mean": mean over seeds}}}; {} unless there are `SEEDS` of each, of both objects.
+
+    Their seed 0 has to be the training that "rmse" shows: a copy's own results do not mix with seeds that are stored.
+    """
+    every = {name: get(results, "seeds", name) or {} for name in OBJECTS}
+    for name, rows in every.items():
+        for method in methods:
+            first = get(rows, f"{method}-0", "rmse_mean")
+            if len(list_seeds(rows, method)) < SEEDS or first != get(results, "rmse", name, method, "rmse_mean"):
+                return {}
+    return {name: {method: {"rmse_mean": statistics.mean(list_seeds(rows, method))} for method in methods}
+            for name, rows in every.items()}  # fmt: skip
+
+
+def tell_apart(results: Results, method: str) -> bool | None:
+    """Whether seeds tell a method from MMGSD of the same supervision, on both objects (`compare_seeds`).
+
+    None where `average_seeds` has no means of the two.
+    """
+    if not average_seeds(results, method, SAME_SUPERVISION[method]):
+        return None
+    tested = compare_seeds({name: results["seeds"][name] for name in OBJECTS}, SAME_SUPERVISION)
+    return all(tested[name, method][1] < LEVEL for name in OBJECTS)
+
+
 def make_first_seed_sentence(results: Results) -> str:
     """What the seed 0 of MMGSD, which other studies rest on, has beside its other seeds."""
     each = {name: list_seeds(results[name], "mmgsd") for name in OBJECTS}
@@ -122,7 +149,7 @@ def count_findings(results: Results) -> dict[str, str]:
 
 
 STUDY = Study(
-    "seeds", 30, partial(run_matrix, seeds=SEEDS), results=("seeds_1000",),
+    "seeds", 30, partial(run_matrix, seeds=SEEDS), results=("seeds_1000", "seeds"),
     tables={
         "seeds": Shown("paper/seeds.json", partial(describe_seeds, others=SAME_SUPERVISION, seen=True)),
         "seeds_1000": Shown("paper/seeds_1000.json", describe_seeds),

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from mmgsd.config import OBJECTS
 from mmgsd.report.tables import describe_claims, list_claims, make_findings, sum_minutes
 from mmgsd.studies.claims import Claim
 from mmgsd.studies.registry import list_studies, load_results
@@ -46,4 +47,29 @@ def test_minutes_are_summed_over_the_runs_that_are_stored(runs: str, minutes: st
                "sigma": {"cloth": {"1": {"run": {"minutes": 7.0}}}},
                "symmetry": {"c4": {"run": {"minutes": 4.0}}, "d4": {"run": {"minutes": 5.0}}},
                "broken_symmetry": {"plain": {"rmse_mean": 3.0}}}  # fmt: skip
-    assert sum_minutes(results, Claim("", "", "", "", (), models=("mmgsd",), runs=runs)) == minutes
+    models = () if runs else ("mmgsd",)
+    assert sum_minutes(results, Claim("", "", "", "", (), models=models, runs=runs)) == minutes
+
+
+def test_minutes_of_a_claims_models_are_those_of_all_their_seeds() -> None:
+    rows = {key: {"run": {"minutes": 2.0}} for key in ("mmgsd-0", "mmgsd-1", "mmgsd_plain-0", "spcl-2")}
+    claim = Claim("", "", "", "", (), models=("mmgsd", "spcl"), runs="seeds")
+    assert sum_minutes({"seeds": {"cloth": rows, "rope": {}}}, claim) == "6"
+
+
+def test_a_claim_is_of_three_seeds_where_they_are_of_the_same_run() -> None:
+    rmse = {name: {"mmgsd_plain": {"rmse_mean": 30.0}, "spcl": {"rmse_mean": 50.0}} for name in OBJECTS}
+    seeds = {name: {f"{method}-{k}": {"rmse_mean": row["rmse_mean"] + k} for method, row in rows.items()
+                    for k in range(3)} for name, rows in rmse.items()}  # fmt: skip
+    claims = {claim.key: claim for claim in list_claims({"rmse": rmse, "seeds": seeds})}
+    assert claims["rmse"].measured == "cloth 31.0, rope 31.0 px, three seeds" and "--seeds 3" in claims["rmse"].command
+    assert claims["better"].measured == "cloth 39 %, rope 39 %, three seeds" and all(claims["better"].parts)
+    assert "--seeds" not in claims["rmse-dense"].command
+    for key, value in (("spcl-0", 51.0), ("spcl-2", None)):  # another run's, and one that is missing
+        other = copy.deepcopy(seeds)
+        if value is None:
+            del other["rope"][key]
+        else:
+            other["rope"][key]["rmse_mean"] = value
+        better = next(claim for claim in list_claims({"rmse": rmse, "seeds": other}) if claim.key == "better")
+        assert better.measured == "cloth 40 %, rope 40 %, one seed" and better.parts == (True, True, None)
