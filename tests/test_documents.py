@@ -182,7 +182,7 @@ def test_every_finding_is_short_and_leads_to_a_section() -> None:
     anchors = list_anchors(ROOT / "data" / "results" / "README.md")
     findings = [finding for study in list_studies() for finding in study.findings]
     assert {finding.section for finding in findings} <= set(anchors)
-    assert all(len(f"{finding.name} {finding.sentence}".split()) <= 25 for finding in findings)
+    assert all(len(f"{finding.name} {finding.text}".split()) <= 25 for finding in findings)
 
 
 @pytest.mark.parametrize("name", ["README.md", "shipped.md"])

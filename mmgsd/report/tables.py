@@ -28,10 +28,12 @@ def list_claims(results: Results) -> list[Claim]:
     return [judge(results) for study in list_studies() for judge in study.claims]
 
 
-def make_findings(results: Results) -> str:
-    """A Markdown list of the main findings, each with a link to its section of the results page."""
+def describe_findings(results: Results) -> Table:
+    """The main findings, each with a link to its section of the results page."""
     findings = sorted((f for study in list_studies() for f in study.findings), key=lambda finding: finding.place)
-    return "\n".join(f"- [**{f.name}**]({DETAIL}#{f.section}){f.sentence.format(**f.count(results))}" for f in findings)
+    columns = [Column(key, page=key, optional=True) for key in (*OBJECTS, "seeds")]
+    rows = {f"[{f.name}]({DETAIL}#{f.section}){f.text}": {"": f.count(results)} for f in findings}
+    return Table("finding", {"": columns}, rows)
 
 
 def describe_claims(results: Results) -> Table:
@@ -66,7 +68,7 @@ def sum_minutes(results: Results, claim: Claim) -> str:
 def list_tables() -> dict[str, Shown]:
     """{name by which documents mark it: table or sentence} of all studies, and of what is made from all of them."""
     tables = {name: table for study in list_studies() for name, table in study.tables.items()}
-    return tables | {"findings": Shown("paper", make_findings), "claims": Shown("paper", describe_claims)}
+    return tables | {"findings": Shown("paper", describe_findings), "claims": Shown("paper", describe_claims)}
 
 
 def update_tables(document: Path, results: Path) -> None:

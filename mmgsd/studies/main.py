@@ -34,7 +34,7 @@ from mmgsd.studies.models import CHANCE_STYLES, PAPER, configure_study, get_labe
 from mmgsd.studies.parameters import Reader, among, check_images, check_made, listed
 from mmgsd.studies.registry import ERROR_MEASURES, Finding, Results, Shown, Study
 from mmgsd.studies.sample import load_sample, load_shipped
-from mmgsd.studies.seeds import MORE, SEEDS, average_seeds, tell_apart
+from mmgsd.studies.seeds import SEEDS, average_seeds, say_count, tell_apart
 from mmgsd.studies.table import LABELS, Table, describe_errors, describe_objects
 
 IMPROVEMENT = 0.477  # on SPCL, as the paper reports it
@@ -130,7 +130,7 @@ def judge_rmse(results: Results, *, row: str = "mmgsd_plain") -> Claim:
     plain = row == "mmgsd_plain"
     return Claim(
         "rmse" if plain else "rmse-dense", f"MMGSD's error is {claim}; here with {OURS[row]}.",
-        "Ours is no larger; a part each object.", f"{list_errors(errors)}, {seeds}", parts,
+        "Ours is no larger; a part each object.", f"{list_errors(errors)}, {say_count(seeds)}", parts,
         models=(row,), **_say_runs(seeds, ALL if plain else "`03_train`, `04_evaluate`"),
     )  # fmt: skip
 
@@ -140,16 +140,16 @@ def judge_better(results: Results) -> Claim:
     gains, seeds = _list_gains(results, "mmgsd_plain", "spcl")
     budget = {name: _compute_gain(get(results, "budget", name), "mmgsd_plain", "spcl") for name in OBJECTS}
     others = {
-        "the same at the studies' budget": (budget, "one seed"),
+        "the same at the studies' budget": (budget, 1),
         "both with dense supervision": _list_gains(results, "mmgsd", "spcl_dense"),
         "MMGSD alone with it": _list_gains(results, "mmgsd", "spcl"),
     }
-    beside = "".join(f"; {other}: {list_shares(row)}, {count}" for other, (row, count) in others.items()
+    beside = "".join(f"; {other}: {list_shares(row)}, {say_count(count)}" for other, (row, count) in others.items()
                      if any(row.values()))  # fmt: skip
     return Claim(
         "better", "MMGSD's error is below SPCL's; here each with its own loss alone.",
         f"It is by {100 * MARGIN:.0f} % or more, a part each object; three seeds tell it from chance on both, a part.",
-        f"{list_shares(gains)}, {seeds}{beside}",
+        f"{list_shares(gains)}, {say_count(seeds)}{beside}",
         (*(is_at_least(each, MARGIN) for each in gains.values()), tell_apart(results, "spcl")),
         models=("mmgsd_plain", "mmgsd", "spcl", "spcl_dense"), **_say_runs(seeds, ALL),
     )  # fmt: skip
@@ -163,23 +163,23 @@ def judge_improvement(results: Results) -> Claim:
         "improvement",
         f"MMGSD's error is {100 * IMPROVEMENT:.1f} % below SPCL's on average; here each with its own loss alone.",
         "MMGSD's mean improvement over the objects is as large.",
-        f"{list_shares(gains)}, mean {say(mean, 'percent')}; {seeds}", (is_at_least(mean, IMPROVEMENT),),
+        f"{list_shares(gains)}, mean {say(mean, 'percent')}; {say_count(seeds)}", (is_at_least(mean, IMPROVEMENT),),
         models=("mmgsd_plain", "spcl"), **_say_runs(seeds, ALL),
     )  # fmt: skip
 
 
-def _read_errors(results: Results, *rows: str) -> tuple[Results, str]:
+def _read_errors(results: Results, *rows: str) -> tuple[Results, int]:
     """{object: {row: errors}} of some rows, means over seeds where all have enough, and of how many seeds they are."""
     means = average_seeds(results, *rows)
-    return (means, MORE) if means else (results.get("rmse", {}), "one seed")
+    return (means, SEEDS) if means else (results.get("rmse", {}), 1)
 
 
-def _say_runs(seeds: str, command: str) -> dict[str, str]:
+def _say_runs(seeds: int, command: str) -> dict[str, str]:
     """What repeats a claim's numbers, and the results file that says what it took, of so many ``seeds``."""
-    return {"command": f"{ALL[:-1]} --seeds {SEEDS}`", "runs": "seeds"} if seeds == MORE else {"command": command}
+    return {"command": f"{ALL[:-1]} --seeds {SEEDS}`", "runs": "seeds"} if seeds > 1 else {"command": command}
 
 
-def _list_gains(results: Results, row: str, other: str) -> tuple[dict[str, float | None], str]:
+def _list_gains(results: Results, row: str, other: str) -> tuple[dict[str, float | None], int]:
     """By how much the error of one row is below the other's, of each object, and of how many seeds (`_read_errors`)."""
     errors, seeds = _read_errors(results, row, other)
     return {name: _compute_gain(errors.get(name), row, other) for name in OBJECTS}, seeds
@@ -190,20 +190,10 @@ def _compute_gain(methods: Mapping[str, Any] | None, method: str, other: str) ->
     return None if ours is None or theirs is None else 1 - ours / theirs
 
 
-def count_findings(results: Results) -> dict[str, str]:
-    """The numbers of the study's findings."""
-
-    def say_gains(row: str, other: str) -> dict[str, str]:
-        """By how much an error is below another's, and of how many seeds."""
-        gains, seeds = _list_gains(results, row, other)
-        return {"gain": " and ".join(f"{100 * gain:.0f} %" for gain in gains.values()), "seeds": seeds}
-
-    told_one, seeds = _list_gains(results, "unimodal", "mmgsd")
-    return {
-        **say_gains("mmgsd_plain", "spcl"),
-        **{f"dense_{key}": text for key, text in say_gains("mmgsd", "spcl_dense").items()},
-        "unimodal": f"{-100 * min(told_one.values()):.0f} %", "unimodal_seeds": seeds,
-    }  # fmt: skip
+def count_finding(results: Results, *, row: str, other: str) -> dict[str, str]:
+    """By how much of the larger error's the two of a finding differ, of each object."""
+    gains, seeds = _list_gains(results, row, other)
+    return {name: say(gain, "percent") for name, gain in gains.items()} | {"seeds": f"{seeds}"}
 
 
 @style.styled
@@ -331,14 +321,12 @@ STUDY = Study(
     },
     claims=(judge_rmse, partial(judge_rmse, row="mmgsd"), judge_better, judge_improvement),
     findings=(
-        Finding(1, "The paper's own loss", " errs {gain} less than SPCL on cloth and rope, {seeds}.",
-                "which-method-is-best", count_findings),
-        Finding(2, "With dense supervision", " on both sides MMGSD errs {dense_gain} less than SPCL, {dense_seeds}.",
-                "which-method-is-best", count_findings),
-        Finding(4, "Telling all matches",
-                " helps little where any pose is as probable: told one, Unimodal has {unimodal} more error at most, "
-                "{unimodal_seeds}.",
-                "which-method-is-best", count_findings),
+        Finding(1, "MMGSD errs less than SPCL", ", each with its own loss alone", "which-method-is-best",
+                partial(count_finding, row="mmgsd_plain", other="spcl")),
+        Finding(2, "The same with dense supervision", " of both", "which-method-is-best",
+                partial(count_finding, row="mmgsd", other="spcl_dense")),
+        Finding(5, "MMGSD errs less than Unimodal", ", told one match, where any pose is as probable",
+                "which-method-is-best", partial(count_finding, row="mmgsd", other="unimodal")),
     ),
     compared=ERROR_MEASURES,
 )  # fmt: skip

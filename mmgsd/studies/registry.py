@@ -69,13 +69,13 @@ class Shown:
 
 @dataclass(frozen=True)
 class Finding:
-    """A sentence of the README with numbers, and the section of the results page that it leads to."""
+    """A row of the README's findings, and the section of the results page that it leads to."""
 
     place: int  # among the findings of all studies
-    name: str
-    sentence: str
+    name: str  # the link
+    text: str  # what goes on after it
     section: str
-    count: Callable[[Results], Mapping[str, str]]  # the numbers that the sentence leaves open
+    count: Callable[[Results], Mapping[str, str]]  # {object: cell}, and under "seeds" of how many it is
 
 
 @dataclass(frozen=True)

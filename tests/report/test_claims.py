@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from mmgsd.config import OBJECTS
-from mmgsd.report.tables import describe_claims, list_claims, make_findings, sum_minutes
+from mmgsd.report.tables import describe_claims, describe_findings, list_claims, sum_minutes
 from mmgsd.studies.claims import Claim
 from mmgsd.studies.registry import list_studies, load_results
 from mmgsd.studies.table import to_markdown
@@ -21,9 +21,20 @@ def test_a_finding_changes_with_its_results() -> None:
     results["rmse"]["cloth"]["mmgsd_plain"]["rmse_mean"] = results["rmse"]["cloth"]["spcl"]["rmse_mean"] / 2
     for seed in range(3):
         results["seeds_1000"]["rope"][f"spcl-{seed}"] = results["seeds_1000"]["rope"][f"mmgsd-{seed}"]
-    lines = make_findings(results).splitlines()
+    head, _, *lines = to_markdown(describe_findings(results)).splitlines()
+    assert head == "| finding | cloth | rope | seeds |"
     assert len(lines) == sum(len(study.findings) for study in list_studies())
-    assert "50 % and" in lines[0] and "SPCL on neither" in lines[2]
+    assert "| 50 % |" in lines[0] and lines[2].endswith("| no | no | 3 |") and lines[3].endswith("| no | yes | 3 |")
+
+
+def test_findings_of_three_seeds_say_so() -> None:
+    results = copy.deepcopy(RESULTS)
+    for name in OBJECTS:
+        for method in ("mmgsd", "unimodal"):
+            first = results["seeds"][name][f"{method}-0"]
+            results["seeds"][name] |= {f"{method}-{k}": first for k in range(3)}
+    lines = to_markdown(describe_findings(results)).splitlines()[2:]
+    assert lines[4].endswith("| 3 % | 3 % | 3 |")
 
 
 def test_every_claim_is_a_row_with_what_repeats_it() -> None:

@@ -251,7 +251,7 @@ def test_budget_table_has_the_objects_that_were_trained() -> None:
     text = make_table("budget_table", results["budget"])
     assert read_rows(text)["SPCL"][0] == "80.0" and "Cloth" in text and "Rope" not in text and "31.3" not in text
     better = next(claim for claim in list_claims(results) if claim.key == "better")
-    assert "the same at the studies' budget: cloth 25 %, rope –, one seed; " in better.measured  # own loss alone, there as well
+    assert "the same at the studies' budget: cloth 25 %, rope –, one seed; " in better.measured  # own loss alone
 
 
 def test_a_longer_training_is_a_row_that_latex_can_set() -> None:

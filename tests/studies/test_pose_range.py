@@ -128,6 +128,6 @@ def test_mean_loss_of_one_match_is_that_of_all():
 
 
 def test_the_finding_tells_both_objects_and_what_was_not_measured():
-    found = pose_range.count_findings(make_results(**CONJECTURE))
-    assert found == {"narrow": "49 % (cloth) and 49 % (rope)", "seeds": ""}
-    assert pose_range.count_findings({}) == {"narrow": "by an unknown share", "seeds": ""}
+    found = pose_range.count_finding(make_results(**CONJECTURE))
+    assert found == {"cloth": "33 %", "rope": "33 %", "seeds": "3"}
+    assert pose_range.count_finding({}) == {"cloth": "–", "rope": "–", "seeds": "0"}
