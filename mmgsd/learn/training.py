@@ -48,6 +48,7 @@ from mmgsd.progress import ProgressBar
 
 PROTOTYPE_EVERY = 4  # each step asks every so many material points
 CHECKPOINT_SECONDS = 60.0  # of training between two checkpoints
+PAUSED = 20  # times the median step's seconds: a step that takes longer was paused
 
 
 def compute_learning_rate(config: TrainConfig, step: int) -> float:
@@ -58,6 +59,15 @@ def compute_learning_rate(config: TrainConfig, step: int) -> float:
     progress = (step - warm_up) / max(1, config.steps - warm_up)
     cosine = 0.5 * (1 + math.cos(math.pi * min(1.0, max(0.0, progress))))
     return config.learning_rate * (min(1.0, (step + 1) / warm_up) * (0.01 + 0.99 * cosine))
+
+
+def leave_out_pause(taken: float, earlier: list[float]) -> float:
+    """Seconds of a step; of one while which the process was stopped, as many as a step may take (`PAUSED`).
+
+    ``earlier`` are the sums of all seconds after each of the steps before.
+    """
+    steps = np.diff(earlier)
+    return min(taken, PAUSED * float(np.median(steps))) if len(steps) > 1 else taken
 
 
 class Bfloat16AsFloat32(TorchFunctionMode):
@@ -218,7 +228,7 @@ class Run:
             optimiser.step()
         self.average.update_parameters(self.network)
         self.step += 1
-        self.seconds += time.perf_counter() - start
+        self.seconds += leave_out_pause(time.perf_counter() - start, [row["seconds"] for row in self.log[-50:]])
         self.log.append({"step": self.step, "loss": loss, "seconds": round(self.seconds, 2)})
         if self.world.rank == 0:
             if self.validate_every and self.step % self.validate_every == 0:

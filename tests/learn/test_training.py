@@ -24,7 +24,7 @@ from mmgsd.files import LockedError, locked
 from mmgsd.learn import training
 from mmgsd.learn.checkpoints import CHECKPOINT, LOG, check_enough
 from mmgsd.learn.objective import compute_loss, compute_sigma
-from mmgsd.learn.training import compute_learning_rate, load_training_images, make_batch, train_model
+from mmgsd.learn.training import compute_learning_rate, leave_out_pause, load_training_images, make_batch, train_model
 from mmgsd.match.matcher import Matcher
 from mmgsd.model.tensors import WEIGHTS, load_metadata
 from mmgsd.model.weights import PLACES
@@ -329,6 +329,12 @@ def test_augmented_points_stay_on_their_mask(cloth_dataset: Path, rng: np.random
     for mask, xy, inside in zip(batch.mask, batch.xy[:, inner], batch.inside[:, inner], strict=True):
         column, row = ((xy[inside] + 0.5) * scale - 0.5).round().long().clamp(0, mask.shape[-1] - 1).T
         assert mask[row, column].all()
+
+
+def test_the_time_of_a_stopped_process_is_not_that_of_a_step() -> None:
+    earlier = [2.0, 3.0, 4.1, 5.1]  # sums: steps of a second
+    assert leave_out_pause(1.2, earlier) == 1.2 and leave_out_pause(700.0, earlier) == pytest.approx(20.0)
+    assert leave_out_pause(9.0, [2.0]) == 9.0  # nothing tells how long a step takes
 
 
 @pytest.mark.parametrize(("start", "end", "expected"), [(64.0, 1.0, [64, 8, 1, 1]), (4.0, 16.0, [16] * 4)])
