@@ -62,7 +62,7 @@ def compute_learning_rate(config: TrainConfig, step: int) -> float:
 
 
 def leave_out_pause(taken: float, earlier: list[float]) -> float:
-    """Seconds of a step; of one while which the process was stopped, as many as a step may take (`PAUSED`).
+    """Seconds of a step; where the process was stopped meanwhile, as many as a step may take (`PAUSED`).
 
     ``earlier`` are the sums of all seconds after each of the steps before.
     """
