@@ -12,7 +12,7 @@ from scipy import stats
 from mmgsd.config import OBJECTS
 from mmgsd.studies.claims import Claim, get, list_errors
 from mmgsd.studies.matrix import ALL, run_matrix
-from mmgsd.studies.registry import Finding, Results, Shown, Study
+from mmgsd.studies.registry import Results, Shown, Study
 from mmgsd.studies.table import LABELS, Table, describe_objects
 
 SEEDS = 3  # from which a spread over seeds is spoken of
@@ -49,9 +49,15 @@ Tested = Mapping[tuple[Any, str], tuple[float, float]]  # as `compare_seeds` has
 
 
 def say_tested(results: Mapping[Any, Results], tested: Tested, name: Any, method: str) -> str | None:
-    """`say_seeds` of one part of the results, with an asterisk where p < `LEVEL`, a dagger where only without Holm."""
-    text, (alone, corrected) = say_seeds(results.get(name, {}), method), tested.get((name, method), (1.0, 1.0))
-    return f"{text}{' *' if corrected < LEVEL else ' †' if alone < LEVEL else ''}" if text else None
+    """`say_seeds` of one part of the results, marked (`mark_tested`)."""
+    text = say_seeds(results.get(name, {}), method)
+    return text and text + mark_tested(tested, name, method)
+
+
+def mark_tested(tested: Tested, name: Any, method: str) -> str:
+    """What follows a number of seeds: an asterisk where p < `LEVEL`, a dagger where only without Holm's correction."""
+    alone, corrected = tested.get((name, method), (1.0, 1.0))
+    return " *" if corrected < LEVEL else " †" if alone < LEVEL else ""
 
 
 def compare_seeds(results: Mapping[Any, Results], others: Mapping[str, str] | None = None) -> Tested:
@@ -88,15 +94,15 @@ def average_seeds(results: Results, *methods: str) -> dict[str, dict[str, dict[s
             for name, rows in every.items()}  # fmt: skip
 
 
-def tell_apart(results: Results, method: str) -> bool | None:
-    """Whether seeds tell a method from MMGSD of the same supervision, on both objects (`compare_seeds`).
+def tell_apart(results: Results, method: str) -> Tested:
+    """`compare_seeds` of a method and MMGSD of the same supervision, corrected for all rows that seeds compare.
 
-    None where `average_seeds` has no means of the two.
+    {} where `average_seeds` has no means of the two.
     """
     if not average_seeds(results, method, SAME_SUPERVISION[method]):
-        return None
+        return {}
     tested = compare_seeds({name: results["seeds"][name] for name in OBJECTS}, SAME_SUPERVISION)
-    return all(tested[name, method][1] < LEVEL for name in OBJECTS)
+    return {(name, method): tested[name, method] for name in OBJECTS}
 
 
 def make_first_seed_sentence(results: Results) -> str:
@@ -140,16 +146,6 @@ def say_count(seeds: int) -> str:
     return {1: "one seed", 2: "two seeds", 3: "three seeds"}.get(seeds, f"{seeds} seeds")
 
 
-def count_finding(results: Results, *, method: str) -> dict[str, str]:
-    """Whether seeds at the studies' budget tell a method from MMGSD, corrected for all that are compared."""
-    rows = results["seeds_1000"]
-    tested = compare_seeds(rows)
-    counts = [len(list_seeds(rows[name], method)) for name in OBJECTS]
-    return {name: "yes" if tested.get((name, method), (1.0, 1.0))[1] < LEVEL else "no" for name in OBJECTS} | {
-        "seeds": f"{min(counts)}"
-    }
-
-
 STUDY = Study(
     "seeds", 30, partial(run_matrix, seeds=SEEDS), results=("seeds_1000", "seeds"),
     tables={
@@ -159,10 +155,4 @@ STUDY = Study(
         "seeds_quick": Shown("quick/seeds.json", describe_seeds),
     },
     claims=(judge_stable,),
-    findings=(
-        Finding(3, "Seeds tell MMGSD with dense supervision from SPCL", " without it, at a smaller budget",
-                "what-does-a-smaller-equal-budget-give", partial(count_finding, method="spcl")),
-        Finding(4, "The same", ", SPCL with it, too",
-                "what-does-a-smaller-equal-budget-give", partial(count_finding, method="spcl_dense")),
-    ),
 )  # fmt: skip

@@ -129,5 +129,7 @@ def test_mean_loss_of_one_match_is_that_of_all():
 
 def test_the_finding_tells_both_objects_and_what_was_not_measured():
     found = pose_range.count_finding(make_results(**CONJECTURE))
-    assert found == {"cloth": "33 %", "rope": "33 %", "seeds": "3"}
+    assert found == {"cloth": "33 % *", "rope": "33 % *", "seeds": "3"}
+    narrow = pose_range.count_finding(make_results(**CONJECTURE | {"within45": 0.5}))
+    assert narrow["cloth"] == "1 %"  # less than seeds differ by
     assert pose_range.count_finding({}) == {"cloth": "–", "rope": "–", "seeds": "0"}
