@@ -240,7 +240,7 @@ def _say_gap(gap: float | None) -> str:
 
 
 def count_finding(results: Results) -> dict[str, str]:
-    """By how much of Unimodal's error MMGSD's is below it within the wider of the narrow limits; marked where tested."""
+    """By how much of Unimodal's error MMGSD's is below it within the wider of the narrow limits (`mark_tested`)."""
     rows, limit = results.get("pose_range", {}), NARROW[-1]
     tested = compare_limits(rows)
     gaps = {name: _compute_gap(rows, name, limit) for name in OBJECTS}

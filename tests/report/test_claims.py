@@ -83,3 +83,16 @@ def test_a_claim_is_of_three_seeds_where_they_are_of_the_same_run() -> None:
             other["rope"][key]["rmse_mean"] = value
         better = next(claim for claim in list_claims({"rmse": rmse, "seeds": other}) if claim.key == "better")
         assert better.measured == "cloth 40 %, rope 40 %, one seed" and better.parts == (True, True, None)
+
+
+def test_stability_is_that_of_the_main_tables_seeds_where_they_are_there() -> None:
+    results = copy.deepcopy(RESULTS)
+    results["seeds"] = {name: {f"{m}-{k}": {"rmse_mean": results["rmse"][name][m]["rmse_mean"] + k * spread}
+                               for m, spread in (("mmgsd", 1.0), ("spcl_dense", 2.0), ("spcl", 3.0)) for k in range(3)}
+                        for name in OBJECTS}  # fmt: skip
+    of_main = next(claim for claim in list_claims(results) if claim.key == "stable")
+    assert of_main.measured.startswith("std, MMGSD: cloth 1.0, rope 1.0 px, SPCL with dense supervision: cloth 2.0")
+    assert of_main.parts == (True, True) and of_main.command.endswith("--seeds 3`") and of_main.runs == "seeds"
+    of_small = next(claim for claim in list_claims({**results, "seeds": {}}) if claim.key == "stable")
+    assert of_small.measured.startswith("std at the studies' budget, MMGSD: cloth 3.2")
+    assert of_small.command.endswith("--steps 1000`") and of_small.runs == "seeds_1000"

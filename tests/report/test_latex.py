@@ -78,7 +78,7 @@ def make_results() -> dict:
         "places": {"cloth": {"corner": 20.0, "edge": 25.0, "interior": 35.0}, "rope": {"end": 20.0, "middle": 40.0}},
         "peaks": dict.fromkeys(OBJECTS, 2),
         "seeds_1000": {name: {f"{m}-{k}": make_errors(e + k * s) for k in range(3)
-                              for m, e, s in (("mmgsd", 40.0, 1.0), ("spcl_dense", 60.0, 3.0), ("spcl", 60.0, 0.1))}
+                              for m, e, s in (("mmgsd", 40.0, 1.0), ("spcl_dense", 60.0, 4.0), ("spcl", 60.0, 0.1))}
                        for name in OBJECTS},
         "seeds": {name: {f"{m}-{k}": make_errors(rmse[m] + k / 10) for k in range(3) for m in ("mmgsd_plain", "spcl")}
                   for name in OBJECTS},
@@ -135,6 +135,7 @@ def test_every_claim_can_hold() -> None:
         ("improvement", ("seeds", "cloth", "spcl-1", "rmse_mean"), 40.0, NOT_HELD),  # 44 % there, of three seeds
         ("improvement", ("rmse", "rope", "mmgsd_plain", "rmse_mean"), 40.0, NOT_HELD),  # 33 % there, 42 % on average
         ("stable", ("seeds_1000", "rope", "mmgsd-2", "rmse_mean"), 90.0, IN_PART),
+        ("stable", ("seeds_1000", "rope", "spcl_dense-2", "rmse_mean"), 65.0, IN_PART),  # less than 5 % of its mean
         ("continuous", ("continuity", "cloth", "spcl", "jumps"), 0.1, IN_PART),
         ("bimodal", ("peaks", "cloth"), 1, IN_PART),
         ("hidden", ("entropy", "rope", "overhand knot"), 8.0, IN_PART),
