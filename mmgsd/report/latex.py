@@ -18,6 +18,7 @@ from mmgsd.files import write_text
 from mmgsd.paths import Paths, find_root
 from mmgsd.report.tables import describe_claims, list_claims
 from mmgsd.studies.registry import Results, Shown, list_studies, load_results, told_where
+from mmgsd.studies.seeds import list_means
 from mmgsd.studies.table import Table, lay_out
 
 NOT_RUN = r"\emph{Not run for this preset.}"
@@ -49,7 +50,8 @@ def write_report(preset: str, root: Path) -> list[Path]:
     with told_where(paths.results):
         claims = list_claims(results)
         described = dataclasses.asdict(config) | {"image_size": IMAGE_SIZE}
-        numbers = {**results, "config": described, "verdict": {claim.key: claim.verdict for claim in claims}}
+        numbers = {**results, "config": described, "verdict": {claim.key: claim.verdict for claim in claims},
+                   "means": list_means(results)}  # fmt: skip
         table = to_latex(describe_claims(results), CLAIMS)
         texts = {"results": make_definitions(preset, numbers), "claims_table": table}
     for name, table in list_tables().items():

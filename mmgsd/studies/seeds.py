@@ -13,7 +13,7 @@ from mmgsd.config import OBJECTS
 from mmgsd.studies.claims import MARGIN, Claim, get, list_errors
 from mmgsd.studies.matrix import ALL, run_matrix
 from mmgsd.studies.registry import Results, Shown, Study
-from mmgsd.studies.table import LABELS, Table, describe_objects
+from mmgsd.studies.table import LABELS, Column, Table
 
 SEEDS = 3  # from which a spread over seeds is spoken of
 LEVEL = 0.05  # of p, from which seeds do not tell two methods apart
@@ -31,18 +31,20 @@ def list_seeds(rows: Results, method: str, measure: str = "rmse_mean") -> list[f
 def describe_seeds(results: Results, others: Mapping[str, str] | None = None, *, seen: bool = False) -> Table:
     """The mean and the std of the RMSE over seeds, from {object: {"mmgsd-0": errors}}, a method a row.
 
-    Marked (`say_tested`) where it differs from MMGSD's, or from that of ``others`` (`compare_seeds`). With ``seen``
-    that over seen matches alone stands beside it.
+    Tested against MMGSD's, or those of ``others`` (`compare_seeds`): the report has p by Holm's correction, a page the
+    marks (`mark_tested`). With ``seen`` the error over seen matches alone stands beside it.
     """
-    tested = compare_seeds(results, others)
-    seeds = {label: {name: say_tested(results, tested, name, method) for name in OBJECTS}
-             | {f"{name} seen": say_seeds(results.get(name, {}), method, "rmse_seen") for name in OBJECTS if seen}
-             for method, label in LABELS.items()}  # fmt: skip
-    heads = {name: name for name in OBJECTS}
-    if seen:
-        heads = {key: head for name in OBJECTS for key, head in ((name, name), (f"{name} seen", "of seen matches"))}
-    return describe_objects("RMSE px: mean ± std (seeds)", {k: row for k, row in seeds.items() if any(row.values())},
-                            heads)  # fmt: skip
+    tested, lines = compare_seeds(results, others), {}
+    for method, label in LABELS.items():
+        rows = {name: {"rmse": say_seeds(results[name], method), "marked": say_tested(results, tested, name, method),
+                       "seen": say_seeds(results[name], method, "rmse_seen"),
+                       "p": tested.get((name, method), (None, None))[1]}
+                for name in OBJECTS if list_seeds(results.get(name, {}), method)}  # fmt: skip
+        lines |= {label: rows} if rows else {}
+    columns = [Column("rmse", "mean ± std (seeds)"), Column("marked", page="mean ± std (seeds)"),
+               *([Column("seen", "of seen matches", "of seen matches", optional=True)] if seen else []),
+               Column("p", "p", form=".3f", optional=True)]  # fmt: skip
+    return Table("RMSE px", {"": columns}, lines, OBJECTS)
 
 
 Tested = Mapping[tuple[Any, str], tuple[float, float]]  # as `compare_seeds` has it
@@ -92,6 +94,19 @@ def average_seeds(results: Results, *methods: str) -> dict[str, dict[str, dict[s
                 return {}
     return {name: {method: {"rmse_mean": statistics.mean(list_seeds(rows, method))} for method in methods}
             for name, rows in every.items()}  # fmt: skip
+
+
+def list_means(results: Results) -> dict[str, dict[str, dict[str, float]]]:
+    """{object: {method: {"rmse_mean": error}}} of "rmse", each the mean over all seeds there are of that training."""
+    means: dict[str, dict[str, dict[str, float]]] = {}
+    for name, rows in results.get("rmse", {}).items():
+        seeds = get(results, "seeds", name) or {}
+        means[name] = {}
+        for method, row in rows.items():
+            same = get(seeds, f"{method}-0", "rmse_mean") == row["rmse_mean"]
+            errors = list_seeds(seeds, method) if same else [row["rmse_mean"]]
+            means[name][method] = {"rmse_mean": statistics.mean(errors)}
+    return means
 
 
 def tell_apart(results: Results, method: str) -> Tested:
@@ -154,7 +169,7 @@ def say_count(seeds: int) -> str:
 STUDY = Study(
     "seeds", 30, partial(run_matrix, seeds=SEEDS), results=("seeds_1000", "seeds"),
     tables={
-        "seeds": Shown("paper/seeds.json", partial(describe_seeds, others=SAME_SUPERVISION, seen=True)),
+        "seeds": Shown("paper/seeds.json", partial(describe_seeds, others=SAME_SUPERVISION, seen=True), "seeds_table"),
         "seeds_1000": Shown("paper/seeds_1000.json", describe_seeds),
         "first_seed": Shown("paper/seeds_1000.json", make_first_seed_sentence),
         "seeds_quick": Shown("quick/seeds.json", describe_seeds),

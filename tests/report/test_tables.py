@@ -11,7 +11,14 @@ from mmgsd.studies import main
 from mmgsd.studies.broken_symmetry import describe_fixes
 from mmgsd.studies.errors import describe_difficulties
 from mmgsd.studies.places import describe_places
-from mmgsd.studies.seeds import SAME_SUPERVISION, STUDY, compare_seeds, describe_seeds, make_first_seed_sentence
+from mmgsd.studies.seeds import (
+    SAME_SUPERVISION,
+    STUDY,
+    compare_seeds,
+    describe_seeds,
+    list_means,
+    make_first_seed_sentence,
+)
 from mmgsd.studies.sigma import describe_sigma
 from mmgsd.studies.symmetry import describe_symmetry
 from mmgsd.studies.table import LABELS, Column, Table, describe_errors, lay_out, to_markdown
@@ -111,7 +118,8 @@ def test_the_error_of_seen_matches_is_of_the_seeds_that_have_it() -> None:
     seen = {f"mmgsd-{k}": {"rmse_mean": 26.0, "rmse_seen": 22.0 + k} for k in (1, 3)}
     cloth = {"mmgsd-0": {"rmse_mean": 26.0}} | seen
     lines = read_page(describe_seeds({"cloth": cloth}, seen=True))
-    assert lines[0] == "| RMSE px: mean ± std (seeds) | cloth | of seen matches | rope | of seen matches |"
+    each = "mean ± std (seeds) | of seen matches"
+    assert lines[0] == f"| RMSE px | cloth: {each} | rope: {each} |"
     assert lines[2] == "| **MMGSD** (ours) | 26.0 ± 0.0 (3) | 24.0 ± 1.4 (2) | – | – |"
 
 
@@ -120,6 +128,23 @@ def test_what_seeds_tell_apart_from_mmgsd_is_marked() -> None:
     cloth = {f"{name}-{seed}": {"rmse_mean": e} for name, found in errors.items() for seed, e in enumerate(found)}
     rows = {line.split(" | ")[0]: line.split(" | ")[1] for line in read_page(describe_seeds({"cloth": cloth}))[2:]}
     assert rows == {"| **MMGSD** (ours)": "51.0 ± 1.0 (3)", "| SPCL": "61.2 ± 1.3 (3) *", "| PCL": "53.3 ± 4.5 (3)"}
+
+
+def test_the_report_has_p_where_a_page_has_marks() -> None:
+    errors = {"mmgsd": (50.0, 51.0, 52.0), "spcl": (60.0, 61.0, 62.5)}
+    cloth = {f"{name}-{seed}": {"rmse_mean": e} for name, found in errors.items() for seed, e in enumerate(found)}
+    p = compare_seeds({"cloth": cloth})["cloth", "spcl"][1]
+    lines = latex.to_latex(describe_seeds({"cloth": cloth})).splitlines()
+    assert rf"SPCL & 61.2 $\pm$ 1.3 (3) & {p:.3f} & -- & -- \\" in lines
+    assert r"\textbf{MMGSD} (ours) & 51.0 $\pm$ 1.0 (3) & -- & -- & -- \\" in lines
+
+
+def test_means_are_over_the_seeds_of_the_same_training() -> None:
+    rmse = {"cloth": {"mmgsd": {"rmse_mean": 26.0}, "spcl": {"rmse_mean": 39.0}, "pcl": {"rmse_mean": 40.0}}}
+    seeds = {"cloth": {"mmgsd-0": {"rmse_mean": 26.0}, "mmgsd-1": {"rmse_mean": 27.0},
+                       "spcl-0": {"rmse_mean": 39.5}, "spcl-1": {"rmse_mean": 41.0}}}  # fmt: skip
+    means = list_means({"rmse": rmse, "seeds": seeds})["cloth"]
+    assert {method: row["rmse_mean"] for method, row in means.items()} == {"mmgsd": 26.5, "spcl": 39.0, "pcl": 40.0}
 
 
 def test_at_the_main_size_seeds_are_compared_under_one_supervision() -> None:
