@@ -262,7 +262,7 @@ STUDY = Study(
     tables={"pose_range": Shown("quick/pose_range.json", describe_limits, "pose_range_table")},
     figures={"pose_range": draw}, claims=(judge_one_match,),
     findings=(
-        Finding(4, "The same where poses are limited", f" to ±{NARROW[-1]}°, at the size of `quick`",
+        Finding(5, "The same where poses are limited", f" to ±{NARROW[-1]}°, at the size of `quick`",
                 "when-is-one-match-as-good-as-all", count_finding),
     ),
 )  # fmt: skip

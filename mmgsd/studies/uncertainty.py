@@ -259,7 +259,7 @@ STUDY = Study(
     tables={"uncertainty": Shown("paper/uncertainty.json", describe_uncertainty, "uncertainty_table")},
     claims=(judge_entropy, judge_inward),
     findings=(
-        Finding(5, "Entropy ranks errors", ", so that the less certain can be refused: rank correlation",
+        Finding(6, "Entropy ranks errors", ", so that the less certain can be refused: rank correlation",
                 "does-an-answer-know-how-wrong-it-is", count_finding),
     ),
     compared={
