@@ -329,7 +329,7 @@ STUDY = Study(
                 partial(count_finding, row="mmgsd_plain", other="spcl")),
         Finding(2, "The same where SPCL is taught hidden matches", ", as MMGSD is", "which-method-is-best",
                 partial(count_finding, row="mmgsd_plain", other="spcl_hidden")),
-        Finding(3, "The same with dense supervision", " of both", "which-method-is-best",
+        Finding(3, "MMGSD errs less than SPCL", ", both with dense supervision", "which-method-is-best",
                 partial(count_finding, row="mmgsd", other="spcl_dense")),
         Finding(4, "MMGSD errs less than Unimodal", ", told one match, where any pose is as probable",
                 "which-method-is-best", partial(count_finding, row="mmgsd", other="unimodal")),
