@@ -38,7 +38,7 @@ from mmgsd.studies.models import ROWS, Model, configure_study, get_colour, get_l
 from mmgsd.studies.parameters import choose_objects
 from mmgsd.studies.policies import Policy
 from mmgsd.studies.registry import Finding, Results, Shown, Study, read_table
-from mmgsd.studies.seeds import Tested, compare_seeds, list_seeds, mark_tested, say_count, say_seeds
+from mmgsd.studies.seeds import Tested, compare_seeds, list_seeds, mark_tested, say_count, say_p, say_seeds
 from mmgsd.studies.table import Column, Table
 
 LIMITS_DEG = (15, 45, 90, 180)  # of the object's turn, both ways; the last is any
@@ -146,13 +146,13 @@ def describe_limits(results: Results) -> Table:
             row = {name: _describe_row(results, name, limit, method) for name in OBJECTS
                    if get_rows(results, name, limit)}  # fmt: skip
             for name in row:
-                row[name]["p"] = tested.get(((name, limit), method), (None, None))[1]
+                row[name]["p"] = say_p(tested, (name, limit), method)
             lines[f"{say_limit(limit)}, {get_label(method, short=True)}"] = row
     columns = [
         Column("rmse", "RMSE", "RMSE px", optional=True),
         Column("found", "≤20", "pck@20px", ".0f", scale=100, optional=True),
         Column("folds", "folds", "folds", optional=True),
-        Column("p", "p", form=".3f", optional=True),
+        Column("p", "p", optional=True),
         Column("any", page="RMSE px, all poses", optional=True),
     ]  # fmt: skip
     return Table("poses, method", {"": columns}, {label: row for label, row in lines.items() if row}, OBJECTS)

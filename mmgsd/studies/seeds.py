@@ -38,12 +38,12 @@ def describe_seeds(results: Results, others: Mapping[str, str] | None = None, *,
     for method, label in LABELS.items():
         rows = {name: {"rmse": say_seeds(results[name], method), "marked": say_tested(results, tested, name, method),
                        "seen": say_seeds(results[name], method, "rmse_seen"),
-                       "p": tested.get((name, method), (None, None))[1]}
+                       "p": say_p(tested, name, method)}
                 for name in OBJECTS if list_seeds(results.get(name, {}), method)}  # fmt: skip
         lines |= {label: rows} if rows else {}
     columns = [Column("rmse", "mean ± std (seeds)"), Column("marked", page="mean ± std (seeds)"),
                *([Column("seen", "of seen matches", "of seen matches", optional=True)] if seen else []),
-               Column("p", "p", form=".3f", optional=True)]  # fmt: skip
+               Column("p", "p", optional=True)]  # fmt: skip
     return Table("RMSE px", {"": columns}, lines, OBJECTS)
 
 
@@ -60,6 +60,12 @@ def mark_tested(tested: Tested, name: Any, method: str) -> str:
     """What follows a number of seeds: an asterisk where p < `LEVEL`, a dagger where only without Holm's correction."""
     alone, corrected = tested.get((name, method), (1.0, 1.0))
     return " *" if corrected < LEVEL else " †" if alone < LEVEL else ""
+
+
+def say_p(tested: Tested, name: Any, method: str) -> str | None:
+    """p by Holm's correction to three decimals, "<0.001" below that; None where nothing is tested."""
+    p = tested.get((name, method), (None, None))[1]
+    return None if p is None else "<0.001" if p < 0.001 else f"{p:.3f}"
 
 
 def compare_seeds(results: Mapping[Any, Results], others: Mapping[str, str] | None = None) -> Tested:

@@ -18,6 +18,7 @@ from mmgsd.studies.seeds import (
     describe_seeds,
     list_means,
     make_first_seed_sentence,
+    say_p,
 )
 from mmgsd.studies.sigma import describe_sigma
 from mmgsd.studies.symmetry import describe_symmetry
@@ -133,9 +134,9 @@ def test_what_seeds_tell_apart_from_mmgsd_is_marked() -> None:
 def test_the_report_has_p_where_a_page_has_marks() -> None:
     errors = {"mmgsd": (50.0, 51.0, 52.0), "spcl": (60.0, 61.0, 62.5)}
     cloth = {f"{name}-{seed}": {"rmse_mean": e} for name, found in errors.items() for seed, e in enumerate(found)}
-    p = compare_seeds({"cloth": cloth})["cloth", "spcl"][1]
+    p = say_p(compare_seeds({"cloth": cloth}), "cloth", "spcl")
     lines = latex.to_latex(describe_seeds({"cloth": cloth})).splitlines()
-    assert rf"SPCL & 61.2 $\pm$ 1.3 (3) & {p:.3f} & -- & -- \\" in lines
+    assert rf"SPCL & 61.2 $\pm$ 1.3 (3) & {p} & -- & -- \\" in lines
     assert r"\textbf{MMGSD} (ours) & 51.0 $\pm$ 1.0 (3) & -- & -- & -- \\" in lines
 
 
@@ -224,3 +225,8 @@ def test_a_document_with_wrong_markers_is_left_alone(document: Path, text: str, 
     with pytest.raises(ValueError, match=message):
         update_tables(document, document.parent)
     assert document.read_text() == text
+
+
+def test_a_p_below_three_decimals_is_not_zero() -> None:
+    tested = {("cloth", "spcl"): (0.00001, 0.0001), ("rope", "spcl"): (0.002, 0.0071)}
+    assert [say_p(tested, name, "spcl") for name in ("cloth", "rope", "towel")] == ["<0.001", "0.007", None]
