@@ -30,6 +30,8 @@ from mmgsd.symmetry import load_group
 
 SURE = 0.95  # a symmetry is broken where an answer is the right one of all matches so often
 CHOSEN = 0.6  # two matches are told apart where an answer is the right one so often; by chance it is in half
+LONGER = "broken_symmetry_4000"  # as many steps as the main table's, of ropes
+AGAIN = "`.venv/bin/python -m mmgsd run broken_symmetry --preset paper --set steps=4000 --set objects=rope`"
 TOLD, RIGHT_PX = "identity", 1e-3  # the group of one match; two distances that differ by less are one
 
 
@@ -87,7 +89,7 @@ def _measure(paths: Paths, object: str, row: Model, images: str, steps: int, *, 
     right = (own.rmse_px[own.visible] <= nearest + RIGHT_PX)[several].mean()
     return summarise({TOLD: files[0]})[TOLD] | {
         "nearest_of_all": float(nearest.mean()), "right": float(right),
-        "train_images": config.render["cloth"].train_images, "run": describe_run(weights),
+        "train_images": scene.train_images, "run": describe_run(weights),
     }  # fmt: skip
 
 
@@ -118,20 +120,22 @@ def judge_rotation_limit(results: Results) -> Claim:
 
 
 def judge_ball(results: Results) -> Claim:
-    """The second fix of prior work."""
+    """The second fix of prior work, from the longer training where it is there."""
+    file = LONGER if LONGER in results else "broken_symmetry"
     fixes = {"plain": "rope, plain", "with a ball": "rope, ball at one end"}
-    rows = {name: get(results, "broken_symmetry", key) for name, key in fixes.items()}
+    rows = {name: get(results, file, key) for name, key in fixes.items()}
     errors, right = ({name: get(row, key) for name, row in rows.items()} for key in ("rmse_mean", "right"))
     return Claim(
         "ball", "A ball at one end of the rope breaks its symmetry.",
         f"PCL takes the right one of the two matches in {100 * CHOSEN:.0f} % of its answers or more.",
         f"{list_errors(errors)}; right {', '.join(say(share, 'percent') for share in right.values())}",
-        (is_at_least(right["with a ball"], CHOSEN),), runs="broken_symmetry",
+        (is_at_least(right["with a ball"], CHOSEN),), runs=file,
+        command=AGAIN if file == LONGER else "",
     )  # fmt: skip
 
 
 STUDY = Study(
-    "broken_symmetry", 70, run, check, "11_broken_symmetry", ("broken_symmetry",), list_shown,
+    "broken_symmetry", 70, run, check, "11_broken_symmetry", ("broken_symmetry", LONGER), list_shown,
     tables={
         "fixes": Shown("paper/broken_symmetry.json", describe_fixes, "fixes_table"),
         "fixes_4000": Shown("paper/broken_symmetry_4000.json", describe_fixes),

@@ -9,6 +9,7 @@ import pytest
 from mmgsd.measure.evaluation import read_results, write_results
 from mmgsd.paths import Paths
 from mmgsd.studies import broken_symmetry
+from mmgsd.studies.claims import HELD, NOT_HELD
 
 
 @pytest.fixture
@@ -39,3 +40,15 @@ def test_other_steps_have_a_file_of_their_own_and_rows_of_other_objects_stay(tmp
 def test_options_are_checked_before_anything_is_rendered(tmp_path: Path, name: str, value: object) -> None:
     with pytest.raises(ValueError, match=name):
         broken_symmetry.check(Paths(tmp_path, "paper"), **{name: value})
+
+
+@pytest.mark.parametrize(("longer", "verdict"), [(None, NOT_HELD), (0.59, NOT_HELD), (0.6, HELD)])
+def test_the_ball_is_judged_by_the_longer_training(longer: float | None, verdict: str) -> None:
+    ball = "rope, ball at one end"
+    results = {"broken_symmetry": {ball: {"rmse_mean": 111.1, "right": 0.52}}}
+    if longer is not None:
+        results["broken_symmetry_4000"] = {ball: {"rmse_mean": 60.0, "right": longer}}
+    claim = broken_symmetry.judge_ball(results)
+    assert claim.verdict == verdict
+    assert claim.measured.startswith("plain –, with a ball 60.0 px" if longer else "plain –, with a ball 111.1 px")
+    assert ("steps=4000" in claim.command) == bool(longer)

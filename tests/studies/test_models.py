@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -35,11 +36,6 @@ from mmgsd.studies.robustness import STEPS, list_models
 ROOT = find_root(Path(__file__).parent)
 PAPER = load_preset("paper")
 NAMES = {  # of the studies whose files of results do not hold their models' names
-    "symmetry": {
-        "v4": "cloth-mmgsd-v4-sigma1-296fdc67",
-        "c4": "cloth-mmgsd-c4-sigma1-e6af25d3",
-        "d4": "cloth-mmgsd-d4-sigma1-57cc41d0",
-    },
     "fixes": {
         "any rotation": "cloth-pcl-identity-r2-453b9419",
         "±45° only": "cloth-pcl-identity-r2-082a9bc6",
@@ -58,6 +54,9 @@ def list_stored(preset: str) -> dict[str, str]:
                 continue
             if "model" in rows:
                 stored["/".join((file.stem, *first.split("-", 1)))] = rows["model"]
+            if "run" in rows:  # "rope, plain", or of cloths alone
+                object, name = first.split(", ") if ", " in first else ("cloth", first)
+                stored[f"{file.stem}/{object}/{name}"] = rows["run"]["model"]
             for second, row in rows.items():
                 if isinstance(row, dict) and "run" in row:
                     stored[f"{file.stem}/{first}/{second}"] = row["run"]["model"]
@@ -66,13 +65,13 @@ def list_stored(preset: str) -> dict[str, str]:
 
 def find_row(preset: str, key: str) -> TrainConfig:
     file, object, name = key.split("/")
-    study, _, steps = file.partition("_")
+    study, steps = re.fullmatch(r"(.*?)(?:_(\d+))?", file).groups()
     if study == "robustness":
         return list_models(preset, object, int(name[-1]) + 1, STEPS)[name]
     varied = {"sigma": lambda: vary_sigma([float(name)]), "seeds": lambda: vary_seed([int(name[-1])]),
               "cells": lambda: cells.SHOWN}  # fmt: skip
     rows = varied[study]() if study in varied else None
-    study = "main" if study == "runs" else study
+    study = {"runs": "main", "broken_symmetry": "fixes"}.get(study, study)
     return configure_study(load_preset(preset), object, study, rows, steps=int(steps or 0))[name]
 
 
@@ -86,7 +85,8 @@ def test_models_whose_results_are_kept_keep_their_names(preset: str, key: str, n
 
 def test_every_file_of_results_with_models_is_looked_at() -> None:
     files = {f"{preset}/{key.split('/')[0]}" for preset, key, _ in STORED}
-    paper = ("runs", "budget", "sigma", "sigma_4000", "seeds", "seeds_1000", "backbones_1500", "cells")
+    paper = ("runs", "budget", "sigma", "sigma_4000", "seeds", "seeds_1000", "backbones_1500", "cells",
+             "symmetry")  # fmt: skip
     quick = ("runs", "sigma", "seeds", "robustness")
     assert files == {f"paper/{name}" for name in paper} | {f"quick/{name}" for name in quick}
 
