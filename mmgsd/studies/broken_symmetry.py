@@ -15,7 +15,7 @@ from typing import Any
 import pandas as pd
 
 from mmgsd.checks import read_count
-from mmgsd.config import DEFAULT_GROUP, OBJECTS, load_preset
+from mmgsd.config import DEFAULT_GROUP, N_POINTS, OBJECTS, load_preset
 from mmgsd.learn.training import train_model
 from mmgsd.measure.evaluation import evaluate_model, load_queries, read_results, summarise, write_results
 from mmgsd.model.tensors import describe_run
@@ -32,6 +32,7 @@ SURE = 0.95  # a symmetry is broken where an answer is the right one of all matc
 CHOSEN = 0.6  # two matches are told apart where an answer is the right one so often; by chance it is in half
 LONGER = "broken_symmetry_4000"  # as many steps as the main table's, of ropes
 AGAIN = "`.venv/bin/python -m mmgsd run broken_symmetry --preset paper --set steps=4000 --set objects=rope`"
+END = 0.03  # of a rope's length, from its first end: about as far as the ball reaches
 TOLD, RIGHT_PX = "identity", 1e-3  # the group of one match; two distances that differ by less are one
 
 
@@ -85,12 +86,20 @@ def _measure(paths: Paths, object: str, row: Model, images: str, steps: int, *, 
     files = [evaluate_model(weights, data, config.evaluate, place.queries(f"{model.name}{suffix}-{group}"), group=group,
                             **options) for group in (TOLD, DEFAULT_GROUP[object])]  # fmt: skip
     own, every = map(load_queries, files)
-    nearest, several = every.nearest_px[own.visible], every.n[own.visible] > 1
-    right = (own.rmse_px[own.visible] <= nearest + RIGHT_PX)[several].mean()
-    return summarise({TOLD: files[0]})[TOLD] | {
-        "nearest_of_all": float(nearest.mean()), "right": float(right),
+    return summarise({TOLD: files[0]})[TOLD] | _compare(own, every, object) | {
         "train_images": scene.train_images, "run": describe_run(weights),
     }  # fmt: skip
+
+
+def _compare(own: pd.DataFrame, every: pd.DataFrame, object: str) -> dict[str, float]:
+    """Of visible queries, asked for one match and for all: px to the nearest match, and shares that are right."""
+    own, every = own[own.visible], every[own.visible]
+    several = every.n > 1
+    right = (own.rmse_px <= every.nearest_px + RIGHT_PX)[several]
+    row = {"nearest_of_all": float(every.nearest_px.mean()), "right": float(right.mean())}
+    if object == "rope":
+        row["right_at_end"] = float(right[own.point[several] < END * N_POINTS].mean())
+    return row
 
 
 def describe_fixes(results: Results) -> Table:
@@ -100,6 +109,8 @@ def describe_fixes(results: Results) -> Table:
         Column("right", "right", "the right one", ".0f", scale=100, optional=True),
         Column("train_images", "trained on", form=",d", optional=True),
     ]  # fmt: skip
+    if any("right_at_end" in row for row in results.values()):
+        columns.append(Column("right_at_end", page="at the first end", form=".0f", scale=100, optional=True))
     return Table("images", {"": columns}, {images: {"": row} for images, row in results.items()})
 
 
@@ -125,10 +136,12 @@ def judge_ball(results: Results) -> Claim:
     fixes = {"plain": "rope, plain", "with a ball": "rope, ball at one end"}
     rows = {name: get(results, file, key) for name, key in fixes.items()}
     errors, right = ({name: get(row, key) for name, row in rows.items()} for key in ("rmse_mean", "right"))
+    at_ball = get(rows["with a ball"], "right_at_end")
     return Claim(
         "ball", "A ball at one end of the rope breaks its symmetry.",
         f"PCL takes the right one of the two matches in {100 * CHOSEN:.0f} % of its answers or more.",
-        f"{list_errors(errors)}; right {', '.join(say(share, 'percent') for share in right.values())}",
+        f"{list_errors(errors)}; right {', '.join(say(share, 'percent') for share in right.values())}"
+        + (f"; on the ball {say(at_ball, 'percent')}" if at_ball is not None else ""),
         (is_at_least(right["with a ball"], CHOSEN),), runs=file,
         command=AGAIN if file == LONGER else "",
     )  # fmt: skip

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 from mmgsd.measure.evaluation import read_results, write_results
@@ -52,3 +53,13 @@ def test_the_ball_is_judged_by_the_longer_training(longer: float | None, verdict
     assert claim.verdict == verdict
     assert claim.measured.startswith("plain –, with a ball 60.0 px" if longer else "plain –, with a ball 111.1 px")
     assert ("steps=4000" in claim.command) == bool(longer)
+
+
+def test_the_end_that_the_ball_is_on_is_counted_by_itself() -> None:
+    own = pd.DataFrame({"point": [0, 18, 19, 312, 600, 0], "visible": [True] * 5 + [False],
+                        "rmse_px": [4.0, 6.0, 9.0, 5.0, 80.0, 99.0]})  # fmt: skip
+    every = own.assign(nearest_px=[4.0, 6.0, 3.0, 5.0, 7.0, 1.0], n=[2, 2, 2, 1, 2, 2])
+    compared = broken_symmetry._compare(own, every, "rope")
+    assert compared == {"nearest_of_all": 5.0, "right": 0.5, "right_at_end": 1.0}  # the middle has one match
+    assert set(broken_symmetry._compare(own, every, "cloth")) == {"nearest_of_all", "right"}
+    assert broken_symmetry._compare(own.assign(rmse_px=9.0), every, "rope")["right_at_end"] == 0.0
