@@ -21,7 +21,7 @@ from mmgsd.measure.evaluation import evaluate_model, load_queries, read_results,
 from mmgsd.model.tensors import describe_run
 from mmgsd.paths import Paths
 from mmgsd.scene.stage import render_dataset
-from mmgsd.studies.claims import Claim, get, is_at_least, list_errors, say
+from mmgsd.studies.claims import Claim, get, is_at_least, list_errors, list_shares, say
 from mmgsd.studies.models import Model, configure_study, list_rows
 from mmgsd.studies.parameters import choose_objects
 from mmgsd.studies.registry import Results, Shown, Study
@@ -134,15 +134,15 @@ def judge_ball(results: Results) -> Claim:
     """The second fix of prior work, from the longer training where it is there."""
     file = LONGER if LONGER in results else "broken_symmetry"
     fixes = {"plain": "rope, plain", "with a ball": "rope, ball at one end"}
-    rows = {name: get(results, file, key) for name, key in fixes.items()}
+    rows = {name: get(results, file, key) for name, key in fixes.items() if get(results, file, key)}
     errors, right = ({name: get(row, key) for name, row in rows.items()} for key in ("rmse_mean", "right"))
-    at_ball = get(rows["with a ball"], "right_at_end")
+    at_ball = get(rows, "with a ball", "right_at_end")
     return Claim(
         "ball", "A ball at one end of the rope breaks its symmetry.",
         f"PCL takes the right one of the two matches in {100 * CHOSEN:.0f} % of its answers or more.",
-        f"{list_errors(errors)}; right {', '.join(say(share, 'percent') for share in right.values())}"
+        f"{list_errors(errors)}; right {list_shares(right) or '–'}"
         + (f"; on the ball {say(at_ball, 'percent')}" if at_ball is not None else ""),
-        (is_at_least(right["with a ball"], CHOSEN),), runs=file,
+        (is_at_least(right.get("with a ball"), CHOSEN),), runs=file,
         command=AGAIN if file == LONGER else "",
     )  # fmt: skip
 

@@ -51,7 +51,8 @@ def test_the_ball_is_judged_by_the_longer_training(longer: float | None, verdict
         results["broken_symmetry_4000"] = {ball: {"rmse_mean": 60.0, "right": longer}}
     claim = broken_symmetry.judge_ball(results)
     assert claim.verdict == verdict
-    assert claim.measured.startswith("plain –, with a ball 60.0 px" if longer else "plain –, with a ball 111.1 px")
+    error, share = (60.0, f"{100 * longer:.0f} %") if longer else (111.1, "52 %")
+    assert claim.measured == f"with a ball {error} px; right with a ball {share}"
     assert ("steps=4000" in claim.command) == bool(longer)
 
 
