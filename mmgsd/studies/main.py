@@ -41,7 +41,7 @@ IMPROVEMENT = 0.477  # on SPCL, as the paper reports it
 DRAWN, POINTS = ("sift", "orb"), (0, 104, 208, 312)  # in the figures: hand-made descriptors, and material points
 OURS = {"mmgsd_plain": "its own loss alone", "mmgsd": "a dense supervision besides, which the paper does not have"}
 HEADLINE = (
-    "mmgsd", "mmgsd_plain", "mmgsd_long", "mmgsd_fine_deep", "spcl_dense", "spcl", "unimodal", "pcl", "sift", "centre",
+    "mmgsd", "mmgsd_plain", "mmgsd_long", "mmgsd_muon", "spcl_dense", "spcl", "unimodal", "pcl", "sift", "centre",
 )  # fmt: skip
 SEGMENTS = 25  # of a rope
 SHOWN = 0.95  # share of a method's errors that the axis of their distribution holds

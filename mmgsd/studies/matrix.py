@@ -57,19 +57,13 @@ def name_task(task: Task) -> str:
     return task.name if isinstance(task, TrainConfig) else "-".join(task)
 
 
-def run_task(
-    task: Task, preset: Preset, root: Path, after: tuple[str, float] | None = None, *, progress: bool = False
-) -> tuple[str, float]:
-    """Train a model and ask it the preset's questions, or ask a baseline, unless that is done; name and RMSE (px).
-
-    Models of the preset that it starts from are trained first; ``after`` is the last one's result, to be waited for.
-    """
+def run_task(task: Task, preset: Preset, root: Path, *, progress: bool = False) -> tuple[str, float]:
+    """Train a model and ask it the preset's questions, or ask a baseline, unless that is done; name and RMSE (px)."""
     paths, name = Paths(root, preset.name), name_task(task)
     if isinstance(task, TrainConfig):
         data = paths.dataset(task.object)
-        for model in (*_find_start(task, preset), task):
-            every = max(1, model.steps // VALIDATIONS)
-            weights = train_model(model, data, paths.model(model), progress=progress, validate_every=every)
+        every = max(1, task.steps // VALIDATIONS)
+        weights = train_model(task, data, paths.model(task), progress=progress, validate_every=every)
         how = {"group": task.group, "progress": progress}
         out = evaluation.evaluate_model(weights, data, preset.evaluate, paths.queries(name), **how)
     else:
@@ -77,13 +71,6 @@ def run_task(
         evaluation.evaluate_baseline(task[1], data, preset.evaluate, out, progress=progress)
     queries = evaluation.load_queries(out)
     return name, float(queries.rmse_px[queries.visible].mean())
-
-
-def _find_start(task: Task, preset: Preset) -> list[TrainConfig]:
-    """The models of the preset that a task starts from, if it does: each from the one before it."""
-    start = task.trunk_weights if isinstance(task, TrainConfig) else ""
-    starts = [model for model in list_runs(preset, STUDIES) if model.name == start]
-    return [*_find_start(starts[0], preset), *starts] if starts else []
 
 
 def run_tasks(tasks: list[Task], preset: Preset, root: Path, *, scheduler: str = "") -> Iterator[tuple]:
@@ -95,11 +82,8 @@ def run_tasks(tasks: list[Task], preset: Preset, root: Path, *, scheduler: str =
         yield from (run_task(task, preset, root, progress=True) for task in tasks)
         return
     with open_client(scheduler) as client:
-        futures = {}
-        for i, task in enumerate(tasks):
-            after = next((futures.get(start.name) for start in reversed(_find_start(task, preset))), None)
-            futures[name_task(task)] = client.submit(run_task, task, preset, root, after, pure=False, priority=-i)
-        yield from (future.result() for future in wait_for_each(client, futures.values()))
+        futures = [client.submit(run_task, task, preset, root, pure=False, priority=-i) for i, task in enumerate(tasks)]
+        yield from (future.result() for future in wait_for_each(client, futures))
 
 
 def train_and_ask(

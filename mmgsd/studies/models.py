@@ -7,7 +7,6 @@ so another value in a row asks for another training.
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -30,14 +29,12 @@ class Rule:
     apply: Callable[[TrainConfig, str], Any]  # of the configuration that the row starts from, and the field's name
 
 
-def times(factor: float, *, of: int = 0) -> Rule:
-    """The start's value times ``factor``: a float, a whole number from 1 on, or the next multiple ``of``."""
+def times(factor: float) -> Rule:
+    """The start's value times ``factor``: a float, or a whole number from 1 on."""
 
     def apply(start: TrainConfig, name: str) -> float:
         """The field's value, from that of ``start``."""
         value = factor * getattr(start, name)
-        if of:
-            return math.ceil(value / of) * of
         return value if isinstance(getattr(start, name), float) else max(1, int(value))
 
     return Rule(f"× {factor:g}", apply)
@@ -83,11 +80,6 @@ MODELS = (
     Model("mmgsd_deep", "MMGSD, deeper network", "mmgsd", {"network": "lite0x2"},
           short="MMGSD, deeper", colour="#B22222"),
     Model("mmgsd_long", "MMGSD, 3 × the steps", "mmgsd", {"steps": times(3)}, ("main",), "MMGSD, longer", "#8A3500"),
-    Model("mmgsd_fine", "MMGSD, then larger images", "mmgsd_long",
-          {"trunk_weights": ITS_OWN, "input_px": times(1.5, of=32), "steps": times(0.25), "learning_rate": times(0.5),
-           "sigma_start_px": 8.0, "prototype_weight": 0.0}, ("main",), "MMGSD, finer", "#4D1D00"),
-    Model("mmgsd_fine_deep", "MMGSD, then deeper network", "mmgsd_fine",
-          {"trunk_weights": ITS_OWN, "network": "lite0x2"}, ("main",), "MMGSD, finest", "#260F00"),
     Model("mmgsd_muon", "MMGSD, Muon, detail branch", "mmgsd_long",
           {"network": "lite0x2fine", "optimiser": "muon", "input_px": times(2), "roundness": 0.05}, ("main",),
           "MMGSD, Muon", "#FF3D00"),

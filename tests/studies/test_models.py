@@ -139,11 +139,12 @@ def test_a_row_differs_from_its_start_in_its_changes_alone() -> None:
 
 def test_values_may_follow_from_what_a_row_starts_from() -> None:
     models = configure_study(load_preset("quick"), "rope", "main")
-    long, fine, deeper = (models[name] for name in ("mmgsd_long", "mmgsd_fine", "mmgsd_fine_deep"))
-    assert (long.steps, fine.steps, fine.input_px, fine.learning_rate) == (810, 202, 192, 0.00075)
-    assert (fine.trunk_weights, deeper.trunk_weights) == (long.name, fine.name)
-    assert (models["mmgsd_muon"].input_px, models["spcl_reference"].steps) == (256, 236)
-    assert configure_study(load_preset("smoke"), "cloth", "main")["mmgsd_fine"].steps == 4
+    assert (models["mmgsd_long"].steps, models["spcl_reference"].steps) == (810, 236)
+    assert models["mmgsd_muon"].input_px == 256
+    models |= configure_study(load_preset("smoke"), "rope", "cells", cells.SHOWN)
+    start, larger, largest = (models[name] for name in ("start", "mmgsd_larger", "mmgsd_largest"))
+    assert (larger.trunk_weights, largest.trunk_weights) == (start.name, larger.name)
+    assert (larger.steps, larger.learning_rate) == (start.steps // 4, start.learning_rate / 2)
     assert ROWS["mmgsd_long"].difference == "steps × 3" and ROWS["±45° only"].difference.endswith("rotation_deg 45.0")
 
 
